@@ -1,0 +1,39 @@
+#pragma once
+
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+
+#include <string>
+#include <vector>
+
+#include "rollout.hpp"
+
+/// Checked passage between numpy arrays and the views of the core.
+namespace diffsim::bindings {
+
+namespace py = pybind11;
+
+using Array = py::array_t<double, py::array::c_style>;
+using OptionalArray = std::optional<Array>;
+
+/// "(2, 3)"
+inline std::string shape_text(const std::vector<py::ssize_t>& shape) {
+    std::string text = "(";
+    for (std::size_t k = 0; k < shape.size(); ++k) text += (k > 0 ? ", " : "") + std::to_string(shape[k]);
+    return text + (shape.size() == 1 ? ",)" : ")");
+}
+
+inline std::vector<py::ssize_t> shape_of(const py::array& array) {
+    return {array.shape(), array.shape() + array.ndim()};
+}
+
+/// Throws unless the array's trailing axes are `core`.
+inline void check_core(const char* name, const Array& array, const std::vector<py::ssize_t>& core) {
+    const std::vector<py::ssize_t> shape = shape_of(array);
+    const bool fits = shape.size() >= core.size() && std::equal(core.rbegin(), core.rend(), shape.rbegin());
+    if (!fits)
+        throw std::invalid_argument(std::string(name) + " must have trailing shape " + shape_text(core) + ", got " +
+                                    shape_text(shape));
+}
+
+}  // namespace diffsim::bindings

@@ -1,0 +1,113 @@
+#include "collision/candidates.hpp"
+
+#include <algorithm>
+
+namespace diffsim {
+namespace {
+
+Box swept_box_of(const Box& box_body, const SweptMesh& swept) {
+    Box box = transformed(box_body, swept.sweep.begin);
+    box.include(transformed(box_body, swept.sweep.end));
+    box.inflate(swept.reach);
+    return box;
+}
+
+Box vertex_box(const SweptMesh& swept, int vertex) {
+    Box box;
+    box.include(swept.sweep.begin * swept.mesh->vertices[vertex]);
+    box.include(swept.sweep.end * swept.mesh->vertices[vertex]);
+    box.inflate(swept.reach);
+    return box;
+}
+
+Box edge_box(const SweptMesh& swept, int edge) {
+    Box box = vertex_box(swept, swept.mesh->edges[edge].p0);
+    box.include(vertex_box(swept, swept.mesh->edges[edge].p1));
+    return box;
+}
+
+Box patch_box(const SweptMesh& swept, int patch) {
+    Box box;
+    for (int v : swept.mesh->patches[patch].vertices) box.include(vertex_box(swept, v));
+    return box;
+}
+
+/// Whether vertices of a cell are to be held against a patch. A sphere's or capsule's patch has no area: the edges
+/// of a mesh cover it, and of two such bodies the vertices of the one with the smaller patch do.
+bool patch_counts(const Patch& own, const Patch& other, ContactType type) {
+    const std::size_t own_size = own.vertices.size(), other_size = other.vertices.size();
+    if (other_size >= 3) return true;
+    if (own_size >= 3) return false;
+    return other_size == 2 || (own_size == 1 && type == ContactType::vertex_patch);
+}
+
+/// Vertices of one cell against the patch of the other.
+void pair_vertices(const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b, ContactType type,
+                   std::vector<FeaturePair>& pairs) {
+    if (cell_a.vertices.empty()) return;
+    if (!patch_counts(a.mesh->patches[cell_a.patch], b.mesh->patches[cell_b.patch], type)) return;
+    const Box box_b = patch_box(b, cell_b.patch);
+    for (int v : cell_a.vertices) {
+        if (!vertex_box(a, v).overlaps(box_b)) continue;
+        if (type == ContactType::vertex_patch)
+            pairs.push_back({type, v, cell_b.patch});
+        else
+            pairs.push_back({type, cell_b.patch, v});
+    }
+}
+
+void pair_cells(const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b,
+                std::vector<FeaturePair>& pairs) {
+    pair_vertices(a, cell_a, b, cell_b, ContactType::vertex_patch, pairs);
+    pair_vertices(b, cell_b, a, cell_a, ContactType::patch_vertex, pairs);
+    for (int ea : cell_a.edges) {
+        const Box box_a = edge_box(a, ea);
+        for (int eb : cell_b.edges)
+            if (box_a.overlaps(edge_box(b, eb))) pairs.push_back({ContactType::edge_edge, ea, eb});
+    }
+}
+
+struct TreePairing {
+    const SweptMesh& a;
+    const SweptMesh& b;
+    std::vector<FeaturePair>& pairs;
+
+    void visit(int node_a, const Box& box_a, int node_b, const Box& box_b) {
+        if (!box_a.overlaps(box_b)) return;
+        const BoxTree::Node& na = a.mesh->tree.nodes[node_a];
+        const BoxTree::Node& nb = b.mesh->tree.nodes[node_b];
+        if (na.is_leaf() && nb.is_leaf()) {
+            pair_cells(a, a.mesh->cells[na.item], b, b.mesh->cells[nb.item], pairs);
+        } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
+            visit(na.left, node_box(a, na.left), node_b, box_b);
+            visit(na.right, node_box(a, na.right), node_b, box_b);
+        } else {
+            visit(node_a, box_a, nb.left, node_box(b, nb.left));
+            visit(node_a, box_a, nb.right, node_box(b, nb.right));
+        }
+    }
+
+    static Box node_box(const SweptMesh& swept, int node) { return swept_box_of(swept.mesh->tree.nodes[node].box, swept); }
+};
+
+}  // namespace
+
+Box swept_box(const SweptMesh& swept) { return swept_box_of(swept.mesh->tree.nodes[0].box, swept); }
+
+void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs) {
+    if (a.mesh->tree.empty() || b.mesh->tree.empty()) return;
+    TreePairing{a, b, pairs}.visit(0, swept_box(a), 0, swept_box(b));
+}
+
+void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices) {
+    if (swept_box(swept).lower.z() > height) return;
+    const Vec3 up0 = swept.sweep.begin.R.row(2), up1 = swept.sweep.end.R.row(2);
+    const double limit0 = height + swept.reach - swept.sweep.begin.t.z();
+    const double limit1 = height + swept.reach - swept.sweep.end.t.z();
+    for (int v : swept.mesh->active_vertices) {
+        const Vec3& x = swept.mesh->vertices[v];
+        if (up0.dot(x) <= limit0 || up1.dot(x) <= limit1) vertices.push_back(v);
+    }
+}
+
+}  // namespace diffsim

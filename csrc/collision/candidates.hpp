@@ -1,0 +1,41 @@
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "geometry/collision_mesh.hpp"
+
+namespace diffsim {
+
+/// The two ends of a motion of one frame. Boxes around both ends of a vertex contain the straight path
+/// between them.
+struct Sweep {
+    Pose begin, end;
+};
+
+/// A mesh in motion, and how far around itself it looks for others.
+struct SweptMesh {
+    const CollisionMesh* mesh;
+    Sweep sweep;
+    double reach;  ///< half-width added to all boxes [m]
+};
+
+enum class ContactType : std::uint8_t { vertex_patch, patch_vertex, edge_edge };
+
+/// A pair of features that may come near each other: vertex of a and patch of b, patch of a and vertex of b,
+/// or an edge of each.
+struct FeaturePair {
+    ContactType type;
+    int feature_a, feature_b;
+};
+
+/// World box around a mesh's swept vertices, inflated by its reach.
+Box swept_box(const SweptMesh& swept);
+
+/// Append every feature pair whose swept boxes overlap, in an order that depends on the meshes alone.
+void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
+
+/// Append the vertices that come within `reach` (the mesh's own) of the half-space z <= height, at either end.
+void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices);
+
+}  // namespace diffsim

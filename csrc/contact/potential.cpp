@@ -1,0 +1,52 @@
+#include "contact/potential.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace diffsim {
+namespace {
+
+constexpr double kMassRatioKnee = 100.0;
+
+}  // namespace
+
+PotentialValue contact_potential(double compression, double pole, double stiffness) {
+    if (!(compression > 0.0)) return {0.0, 0.0, 0.0};
+    const double rest = 1.0 - compression / pole;
+    if (!(rest > 0.0)) {
+        constexpr double infinity = std::numeric_limits<double>::infinity();
+        return {infinity, infinity, infinity};
+    }
+    return {0.5 * stiffness * compression * compression / rest,
+            stiffness * compression * (1.0 - 0.5 * compression / pole) / (rest * rest),
+            stiffness / (rest * rest * rest)};
+}
+
+Mollifier edge_mollifier(double sine_sq) {
+    if (sine_sq >= kParallelLimit) return {1.0, 0.0, 0.0};
+    const double ratio = sine_sq / kParallelLimit;
+    return {ratio * (2.0 - ratio), 2.0 * (1.0 - ratio) / kParallelLimit, -2.0 / (kParallelLimit * kParallelLimit)};
+}
+
+ContactStiffness contact_stiffness(double mass_a, double mass_b, double compliance) {
+    if (std::isinf(mass_b)) return {mass_a / compliance, 1.0 / mass_a, 0.0};
+    if (std::isinf(mass_a)) return {mass_b / compliance, 0.0, 1.0 / mass_b};
+    const double sum = mass_a + mass_b;
+    ContactStiffness result{mass_a * mass_b / sum / compliance, 1.0 / mass_a - 1.0 / sum, 1.0 / mass_b - 1.0 / sum};
+    const double ratio = std::max(mass_a, mass_b) / std::min(mass_a, mass_b);
+    if (ratio > kMassRatioKnee) {
+        result.value *= ratio / kMassRatioKnee;
+        const double sign = mass_a > mass_b ? 1.0 : -1.0;
+        result.log_gradient_a += sign / mass_a;
+        result.log_gradient_b -= sign / mass_b;
+    }
+    return result;
+}
+
+ContactRange contact_range(double margin_sum, double thickness) {
+    const double depth = std::min(margin_sum, thickness);
+    return {margin_sum, margin_sum - 0.1 * depth, margin_sum - 0.9 * depth, margin_sum - 0.95 * depth};
+}
+
+}  // namespace diffsim

@@ -1,0 +1,45 @@
+#pragma once
+
+/// The energy of one contact: soft enough to be solved to rounding, stiff enough to be invisible.
+namespace diffsim {
+
+/// Energy of a compression and its derivatives with respect to the compression.
+struct PotentialValue {
+    double energy;     ///< [kg·m²]; the step's energy is in units of force times length times step²
+    double force;      ///< first derivative
+    double stiffness;  ///< second derivative
+};
+
+/// phi(p) = k/2 p² / (1 - p/P) for 0 < p < P, nothing for p <= 0, infinite from P on: the plain quadratic at
+/// ordinary loads, with a pole that no load gets through.
+PotentialValue contact_potential(double compression, double pole, double stiffness);
+
+/// Factor on the energy of a pair of edges, a function of the squared sine c of their angle:
+/// mu = 2c/e - (c/e)² below e = kParallelLimit, 1 from there on. Between parallel edges the closest points jump;
+/// vertex-patch pairs act there.
+struct Mollifier {
+    double value, first, second;  ///< and its derivatives with respect to c
+};
+inline constexpr double kParallelLimit = 1e-3;
+Mollifier edge_mollifier(double sine_sq);
+
+/// Stiffness k of a contact between bodies of these masses; a body that does not yield has infinite mass. It
+/// depends on masses alone, so that it need not be differentiated with respect to the geometry:
+/// k = reduced mass / compliance, times mass ratio / 100 where that is above 1: a light body under a heavy one
+/// carries many times its own weight.
+struct ContactStiffness {
+    double value;
+    double log_gradient_a, log_gradient_b;  ///< d(log k)/d(mass) [1/kg]
+};
+ContactStiffness contact_stiffness(double mass_a, double mass_b, double compliance);
+
+/// The distances at which things happen between two surfaces with this sum of margins.
+struct ContactRange {
+    double rest;     ///< contact pushes below this [m]
+    double landing;  ///< what a linearised impact aims at: inside the contact's reach, far from its pole [m]
+    double floor;    ///< motions are stopped here [m]
+    double pole;     ///< the energy is infinite here [m]
+};
+ContactRange contact_range(double margin_sum, double thickness);
+
+}  // namespace diffsim

@@ -1,0 +1,31 @@
+#pragma once
+
+#include "contact/zone.hpp"
+
+namespace diffsim {
+
+/// Which part of its motion a zone's list of contacts is complete for: all coordinates within `slack` of the segment
+/// from `begin` to `end`.
+struct ContactCoverage {
+    Coordinates begin, end;
+    std::vector<double> slack;  ///< one per dynamic body [m]
+};
+
+/// List the zone's contacts for motions along the segment from `begin` to `end` and somewhat around it. Bodies of
+/// `passive` that come near join the zone. `begin` and `end` are extended where bodies join.
+ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end);
+
+/// Whether the list is complete at these coordinates.
+bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordinates& y);
+
+/// A contact hit on the way.
+struct Impact {
+    int contact;
+    double toi;  ///< in [0, 1] of the motion
+};
+
+/// How far the zone may go from an evaluated point towards y_end, vertices on straight lines, before some pair comes
+/// to its floor; at most 1. `impacts`, if given, receives the pairs that do, in the order of the contacts.
+double allowed_step(const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts);
+
+}  // namespace diffsim

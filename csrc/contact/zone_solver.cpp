@@ -1,0 +1,338 @@
+#include "contact/zone_solver.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace diffsim {
+namespace {
+
+constexpr double kArmijo = 1e-4;
+constexpr int kMaxHalvings = 50;
+constexpr int kMaxStalls = 3;              // steps in a row that get a driven body nowhere
+constexpr double kStall = 1e-3;            // of the way that is left
+constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
+
+/// State of one solve; the steps of solve_zone as members.
+class ZoneSolver {
+public:
+    ZoneSolver(Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+               std::vector<Box>& visited)
+        : m_zone(zone), m_passive(passive), m_options(options), m_w(workspace), m_visited(visited) {}
+
+    ZoneResult solve() {
+        start();
+        if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
+        go_to_warm_start();
+        iterate();
+        return m_result;
+    }
+
+private:
+    Coordinates& y() { return m_w.point.y; }
+
+    // --- start -------------------------------------------------------------------------------------------------
+
+    void start() {
+        const std::size_t count = static_cast<std::size_t>(m_zone.dynamic_count);
+        m_zone.bodies.resize(count);  // those that do not yield join anew
+        m_w.point.y.assign(count, Vec6::Zero());
+        m_w.y_end.resize(count);
+        for (std::size_t i = 0; i < count; ++i) m_w.y_end[i] = m_zone.bodies[i].target;
+        list_contacts(m_w.y_end);
+        evaluate(m_zone, m_w.point);
+        for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+            if (m_w.point.distances[k] > m_zone.contacts[k].range.pole) continue;
+            m_result.status = ZoneStatus::bad_start;
+            m_result.worst_contact = static_cast<int>(k);
+            return;
+        }
+        m_visited.assign(count, Box());
+        mark_visited();
+    }
+
+    /// List contacts for the way from the current point to y_end.
+    void list_contacts(Coordinates& y_end) {
+        m_coverage = collect_contacts(m_zone, m_passive, y(), y_end);
+        m_w.system.set_pattern(m_zone.dynamic_count, m_zone.pairs);
+    }
+
+    /// Make the list complete for a step to y_end; true if it had to be made anew.
+    bool ensure_covered(Coordinates& y_end) {
+        if (is_covered(m_zone, m_coverage, y()) && is_covered(m_zone, m_coverage, y_end)) return false;
+        list_contacts(y_end);
+        evaluate(m_zone, m_w.point);
+        return true;
+    }
+
+    void mark_visited() {
+        for (int i = 0; i < m_zone.dynamic_count; ++i)
+            m_visited[i].include(transformed(m_zone.mesh(i).tree.nodes[0].box, m_w.point.poses[i]));
+    }
+
+    /// Nothing touches on the way to the target and there: done without an iteration.
+    bool try_free_motion() {
+        if (!m_w.point.active.empty()) return false;
+        m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
+        for (int i = 0; i < m_zone.body_count(); ++i) m_w.y_end[i] = m_zone.bodies[i].target;
+        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
+        m_w.trial.y = m_w.y_end;
+        evaluate(m_zone, m_w.trial);
+        if (!m_w.trial.active.empty()) return false;
+        accept_trial();
+        return true;
+    }
+
+    /// Last step's motion already respected last step's contacts: it is the natural first iterate.
+    void go_to_warm_start() {
+        m_w.y_end = y();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end[i] = m_zone.bodies[i].warm;
+        ensure_covered(m_w.y_end);
+        const double step = clear_step(m_w.y_end);
+        if (step > 0.0) accept_trial();
+    }
+
+    // --- moving ------------------------------------------------------------------------------------------------
+
+    void accept_trial() {
+        std::swap(m_w.point, m_w.trial);
+        mark_visited();
+    }
+
+    /// Evaluate the trial at the longest allowed part of the way to y_end. A shortened arc is not on the chord that was
+    /// checked, so it is checked again. 0 if no part is allowed.
+    double clear_step(const Coordinates& y_end) {
+        double step = 1.0;
+        m_w.trial.y = y_end;
+        for (int k = 0; k < 20; ++k) {
+            const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
+            if (allowed == 1.0) {
+                evaluate(m_zone, m_w.trial);
+                if (m_w.trial.energy < kInfinity) return step;
+            }
+            step *= allowed < 1.0 ? allowed : 0.5;
+            set_trial(y_end, step);
+        }
+        return 0.0;
+    }
+
+    void set_trial(const Coordinates& y_end, double step) {
+        for (std::size_t i = 0; i < m_w.trial.y.size(); ++i) m_w.trial.y[i] = y()[i] + step * (y_end[i] - y()[i]);
+    }
+
+    bool drives_done() const {
+        for (int i = m_zone.dynamic_count; i < m_zone.body_count(); ++i)
+            if (m_w.point.y[i] != m_zone.bodies[i].target) return false;
+        return true;
+    }
+
+    // --- Newton ------------------------------------------------------------------------------------------------
+
+    struct Accuracy {
+        double residual;  ///< relative
+        double floor;     ///< what rounding leaves of it
+    };
+
+    Accuracy accuracy() const {
+        double residual = 0.0, reference = m_w.derivatives.largest_force, position = m_zone.model->thickness;
+        double lightest = kInfinity;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) {
+            const ZoneBody& body = m_zone.bodies[i];
+            const Vec6& g = m_w.derivatives.gradient[i];
+            residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
+            reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
+            position = std::max(position, body.start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
+            lightest = std::min(lightest, body.mass);
+        }
+        if (!(reference > 0.0)) return {0.0, 0.0};
+        return {residual / reference, kEpsilon * position * m_w.derivatives.largest_stiffness / reference};
+    }
+
+    static double scaled(const Mat3& turn_metric, double shift_metric, const Vec6& v) {
+        const Vec3 turn = v.head<3>();
+        return std::sqrt(turn.dot(turn_metric * turn) + shift_metric * v.tail<3>().squaredNorm());
+    }
+
+    void differentiate_here(Curvature curvature) {
+        differentiate(m_zone, m_w.point, curvature, m_w.derivatives, &m_w.system);
+    }
+
+    /// The Newton step, from the exact Hessian where that is positive definite. False if rounding spoils even the other.
+    bool newton_step() {
+        differentiate_here(Curvature::exact);
+        if (!m_w.system.factorize()) {
+            differentiate_here(Curvature::projected);
+            if (!m_w.system.factorize()) return false;
+        }
+        m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count));
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step[i] = -m_w.derivatives.gradient[i];
+        m_w.system.solve_in_place(m_w.step);
+        for (const Vec6& s : m_w.step)
+            if (!s.allFinite()) return false;
+        return true;
+    }
+
+    double slope(const Coordinates& gradient) const {
+        double sum = 0.0;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) sum += gradient[i].dot(m_w.y_end[i] - m_w.point.y[i]);
+        return sum;
+    }
+
+    double largest_move() const {
+        double largest = 0.0;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) {
+            const Vec6 move = m_w.y_end[i] - m_w.point.y[i];
+            largest = std::max({largest, move.tail<3>().norm(), move.head<3>().norm() * m_zone.mesh(i).radius});
+        }
+        return largest;
+    }
+
+    /// What rounding can do to the energy.
+    double energy_noise() const {
+        double position = 0.0;
+        for (int i = 0; i < m_zone.dynamic_count; ++i)
+            position = std::max(position, m_zone.bodies[i].start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
+        double force_sum = 0.0;
+        for (const ActiveContact& active : m_w.point.active) {
+            const ZoneContact& contact = m_zone.contacts[active.index];
+            const double pole = contact.range.rest - contact.range.pole;
+            force_sum +=
+                contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
+        }
+        return 1e-15 * std::abs(m_w.point.energy) + 8.0 * kEpsilon * position * force_sum;
+    }
+
+    /// Backtrack along the way to y_end until the energy falls. At rest its fall drowns in rounding: there the slope
+    /// tells. False if no step does.
+    bool line_search(double first_step) {
+        const double slope0 = slope(m_w.derivatives.gradient);
+        const double noise = energy_noise();
+        double step = first_step;
+        for (int k = 0; k < kMaxHalvings; ++k, step *= 0.5) {
+            if (step == 1.0)
+                m_w.trial.y = m_w.y_end;
+            else
+                set_trial(m_w.y_end, step);
+            if (step < 1.0 && k > 0 && allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr) < 1.0) continue;
+            evaluate(m_zone, m_w.trial);
+            const double change = m_w.trial.energy - m_w.point.energy;
+            if (change <= kArmijo * step * slope0) return true;
+            if (change <= noise) {
+                differentiate(m_zone, m_w.trial, Curvature::none, m_w.trial_derivatives, nullptr);
+                const double slope1 = std::abs(slope(m_w.trial_derivatives.gradient));
+                if (slope1 <= std::max(0.9 * std::abs(slope0), noise)) return true;
+            }
+        }
+        return false;
+    }
+
+    void iterate() {
+        int stalls = 0;
+        for (m_result.iterations = 0;; ++m_result.iterations) {
+            const bool driven = drives_done();
+            if (!newton_step()) return fail(ZoneStatus::no_descent);
+            Accuracy now = accuracy();
+            m_result.residual = now.residual;
+            m_w.y_end = y();
+            for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end[i] += m_w.step[i];
+            const double rounding_step = 16.0 * kEpsilon * position_scale();
+            if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
+                polish();
+                return;
+            }
+            if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
+
+            // The step's end may lie where contacts have not been listed yet. New ones are beyond their rest distance
+            // here, so energy and derivatives stand.
+            if (driven) ensure_covered(m_w.y_end);
+            double step = driven ? allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) : 0.0;
+            if (step < kClampedStep) step = past_impacts(step, driven);
+            if (step == 1.0) step = arc_step(1.0);
+            if (driven ? !line_search(step) : !advance_drives(step, stalls)) {
+                if (driven && now.residual < 1e3 * std::max(m_options.tolerance, now.floor)) return;
+                return fail(driven ? ZoneStatus::no_descent : ZoneStatus::blocked);
+            }
+            accept_trial();
+        }
+    }
+
+    double position_scale() const {
+        double position = m_zone.model->thickness;
+        for (int i = 0; i < m_zone.dynamic_count; ++i)
+            position = std::max(position, m_zone.bodies[i].start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
+        return position;
+    }
+
+    /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
+    double past_impacts(double newton_limit, bool driven) {
+        Coordinates target = y();
+        for (int i = 0; i < m_zone.body_count(); ++i) target[i] = m_zone.bodies[i].target;
+        ensure_covered(target);
+        ImpactDirection direction = impact_direction(m_zone, m_w.point, m_w.system);
+        for (int k = 0; k < 8 && !is_covered(m_zone, m_coverage, direction.y_end); ++k) {
+            list_contacts(direction.y_end);
+            evaluate(m_zone, m_w.point);
+            direction = impact_direction(m_zone, m_w.point, m_w.system);
+        }
+        const Coordinates newton_end = m_w.y_end;
+        m_w.y_end = direction.y_end;
+        m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
+        const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
+        if (good) return arc_step(direction.step);
+        m_w.y_end = newton_end;
+        for (int i = static_cast<int>(newton_end.size()); i < m_zone.body_count(); ++i)
+            m_w.y_end.push_back(m_zone.bodies[i].target);
+        return arc_step(newton_limit);
+    }
+
+    /// Shorten a step until the chords to its end are clear.
+    double arc_step(double step) {
+        for (int k = 0; k < 20 && step > 0.0; ++k) {
+            m_w.trial.y.resize(m_w.y_end.size());
+            if (step == 1.0)
+                m_w.trial.y = m_w.y_end;
+            else
+                set_trial(m_w.y_end, step);
+            const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
+            if (allowed == 1.0) return step;
+            step *= allowed;
+        }
+        return 0.0;
+    }
+
+    /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
+    bool advance_drives(double step, int& stalls) {
+        stalls = step < kStall ? stalls + 1 : 0;
+        if (stalls > kMaxStalls || step == 0.0) return false;
+        const double reached = clear_step(m_w.y_end);
+        return reached > 0.0;
+    }
+
+    /// One more full Newton step, past the tolerance: it takes the solution to rounding, which gradients feel.
+    void polish() {
+        if (m_w.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return;
+        if (!is_covered(m_zone, m_coverage, m_w.y_end)) return;
+        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return;
+        m_w.trial.y = m_w.y_end;
+        evaluate(m_zone, m_w.trial);
+        if (m_w.trial.energy <= m_w.point.energy + energy_noise()) accept_trial();
+    }
+
+    void fail(ZoneStatus status) { m_result.status = status; }
+
+    Zone& m_zone;
+    const PassiveBodies& m_passive;
+    const ZoneOptions& m_options;
+    ZoneWorkspace& m_w;
+    std::vector<Box>& m_visited;
+    ContactCoverage m_coverage;
+    ZoneResult m_result;
+};
+
+}  // namespace
+
+ZoneResult solve_zone(Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+                      std::vector<Box>& visited) {
+    return ZoneSolver(zone, passive, options, workspace, visited).solve();
+}
+
+}  // namespace diffsim

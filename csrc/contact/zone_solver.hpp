@@ -1,0 +1,43 @@
+#pragma once
+
+#include "contact/impact_qp.hpp"
+
+namespace diffsim {
+
+enum class ZoneStatus {
+    converged,
+    too_many_iterations,
+    no_descent,    ///< the line search found no lower energy
+    blocked,       ///< a driven body cannot reach its target: something is squeezed
+    bad_start,     ///< objects at or below their pole at the start of the step
+};
+
+struct ZoneOptions {
+    double tolerance = 1e-10;  ///< on the residual
+    int max_iterations = 200;
+};
+
+struct ZoneResult {
+    ZoneStatus status = ZoneStatus::converged;
+    int iterations = 0;     ///< Newton steps
+    double residual = 0.0;  ///< largest |L⁻¹ g| of a body, M = L Lᵀ, relative to the largest contact force
+    int worst_contact = -1;  ///< for bad_start and blocked: index into Zone::contacts, or -1
+};
+
+/// Scratch that keeps its memory from zone to zone.
+struct ZoneWorkspace {
+    ZonePoint point, trial;
+    ZoneDerivatives derivatives, trial_derivatives;
+    BlockSystem system;
+    Coordinates step, y_end;
+    Box swept;
+};
+
+/// Minimise the zone's energy from y = 0 by Newton's method, every iterate penetration-free: contacts are listed,
+/// warm-started and stopped by CCD as docs/contact.md describes. On return workspace.point is the last iterate: the
+/// minimiser, or if the status says so the last penetration-free point before failure. `visited`, one box per dynamic
+/// body, receives the space swept by the bodies' vertices in the zone frame.
+ZoneResult solve_zone(Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+                      std::vector<Box>& visited);
+
+}  // namespace diffsim

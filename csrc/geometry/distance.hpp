@@ -1,0 +1,40 @@
+#pragma once
+
+#include <array>
+#include <cstdint>
+
+#include "math/types.hpp"
+
+/// Distances between convex features, typed: which vertex, edge or face interior holds the closest
+/// points decides how they slide when the features move, and so the second derivative.
+namespace diffsim {
+
+/// The closest points of features a and b, and along which directions each may slide on its feature.
+struct ClosestPoints {
+    Vec3 point_a, point_b;
+    int slide_count_a = 0;           ///< 0 at a vertex, 1 on an edge, 2 inside a face
+    int slide_count_b = 0;
+    std::array<Vec3, 2> slide_a;     ///< orthonormal directions, the first slide_count_a of them
+    std::array<Vec3, 2> slide_b;
+    std::uint32_t feature_code = 0;  ///< tells the type and the sub-features apart, for signatures
+
+    double distance() const { return (point_a - point_b).norm(); }
+};
+
+/// A planar convex polygon in space.
+struct PolygonView {
+    const Vec3* vertices;
+    int count;
+    Vec3 normal;  ///< unit; zero for a polygon without area, which is then treated as its boundary
+};
+
+/// Area-weighted normal of a polygon, unit length, or zero when its area vanishes.
+Vec3 polygon_normal(const Vec3* vertices, int count);
+
+/// Vertex x (feature a) against a convex polygon (feature b).
+ClosestPoints closest_vertex_polygon(const Vec3& x, const PolygonView& polygon);
+
+/// Segment a0-a1 (feature a) against segment b0-b1 (feature b).
+ClosestPoints closest_edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, const Vec3& b1);
+
+}  // namespace diffsim

@@ -1,0 +1,37 @@
+#pragma once
+
+#include <vector>
+
+#include "math/types.hpp"
+
+namespace diffsim {
+
+/// One rigid body: the pose of its centre of mass and its velocities, in the world frame.
+struct BodyState {
+    Vec3 position = Vec3::Zero();               ///< [m]
+    Vec4 orientation = Vec4(1, 0, 0, 0);        ///< unit quaternion w, x, y, z: body to world
+    Vec3 velocity = Vec3::Zero();               ///< [m/s]
+    Vec3 angular_velocity = Vec3::Zero();       ///< [rad/s]
+};
+
+using SceneState = std::vector<BodyState>;
+
+/// What drives one body during a step.
+struct BodyControl {
+    Vec3 force = Vec3::Zero();             ///< world frame, at the centre of mass [N]
+    Vec3 torque = Vec3::Zero();            ///< world frame [N·m]
+    Vec3 velocity = Vec3::Zero();          ///< of a kinematic body [m/s]
+    Vec3 angular_velocity = Vec3::Zero();  ///< of a kinematic body [rad/s]
+};
+
+using SceneControl = std::vector<BodyControl>;
+
+/// d(loss)/d(BodyState), with the orientation's as a rotation covector (math/rotation.hpp).
+struct BodyStateGradient {
+    Vec3 position = Vec3::Zero();
+    Vec3 orientation = Vec3::Zero();
+    Vec3 velocity = Vec3::Zero();
+    Vec3 angular_velocity = Vec3::Zero();
+};
+
+}  // namespace diffsim

@@ -1,0 +1,326 @@
+#include "rollout.hpp"
+
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cmath>
+#include <exception>
+#include <mutex>
+#include <sstream>
+#include <stdexcept>
+#include <thread>
+
+#include "math/rotation.hpp"
+
+namespace diffsim {
+namespace {
+
+constexpr double kUnitTolerance = 1e-3;  // on |q|: single precision states pass, mistakes do not
+
+template <int Rows>
+Eigen::Map<const Eigen::Matrix<double, Rows, 1>> row(const double* data, int index) {
+    return Eigen::Map<const Eigen::Matrix<double, Rows, 1>>(data + Rows * index);
+}
+
+template <int Rows>
+Eigen::Map<Eigen::Matrix<double, Rows, 1>> row(double* data, int index) {
+    return Eigen::Map<Eigen::Matrix<double, Rows, 1>>(data + Rows * index);
+}
+
+/// Call work(scene, thread) for every scene, on several threads if there are several scenes. The first exception, by
+/// scene, is thrown on.
+template <typename Work>
+void for_each_scene(int batch, int thread_count, const Work& work) {
+    thread_count = std::min(thread_count, batch);
+    if (thread_count <= 1) {
+        for (int scene = 0; scene < batch; ++scene) work(scene, 0);
+        return;
+    }
+    std::atomic<int> next{0};
+    std::vector<std::exception_ptr> errors(static_cast<std::size_t>(batch));
+    const auto run = [&](int thread) {
+        for (int scene = next++; scene < batch; scene = next++) {
+            try {
+                work(scene, thread);
+            } catch (...) {
+                errors[scene] = std::current_exception();
+            }
+        }
+    };
+    std::vector<std::thread> threads;
+    for (int t = 1; t < thread_count; ++t) threads.emplace_back(run, t);
+    run(0);
+    for (std::thread& thread : threads) thread.join();
+    for (const std::exception_ptr& error : errors)
+        if (error) std::rethrow_exception(error);
+}
+
+// --- inputs --------------------------------------------------------------------------------------------------------
+
+[[noreturn]] void refuse(const std::string& field, const Model& model, int body, const std::string& problem) {
+    throw std::invalid_argument(field + " of body '" + model.name(body) + "' (index " + std::to_string(body) + ") " +
+                                problem);
+}
+
+template <typename Vector>
+void require_finite(const char* field, const Model& model, int body, const Vector& value) {
+    if (value.allFinite()) return;
+    std::ostringstream text;
+    text << "must be finite, got (" << value.transpose() << ")";
+    refuse(field, model, body, text.str());
+}
+
+SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
+    SceneState state(model.bodies.size());
+    for (int i = 0; i < model.body_count(); ++i) {
+        BodyState& body = state[i];
+        body.position = row<3>(in.position.at(0, scene), i);
+        body.orientation = row<4>(in.orientation.at(0, scene), i);
+        body.velocity = row<3>(in.velocity.at(0, scene), i);
+        body.angular_velocity = row<3>(in.angular_velocity.at(0, scene), i);
+        require_finite("state.position", model, i, body.position);
+        require_finite("state.orientation", model, i, body.orientation);
+        require_finite("state.velocity", model, i, body.velocity);
+        require_finite("state.angular_velocity", model, i, body.angular_velocity);
+        const double norm = body.orientation.norm();
+        if (!(std::abs(norm - 1.0) <= kUnitTolerance))
+            refuse("state.orientation", model, i,
+                   "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) + "; divide it by its norm");
+        body.orientation /= norm;
+    }
+    return state;
+}
+
+Parameters read_parameters(const Model& model, const RolloutInputs& in, int scene) {
+    Parameters parameters;
+    parameters.gravity = row<3>(in.gravity.at(0, scene), 0);
+    if (!parameters.gravity.allFinite()) throw std::invalid_argument("gravity must be finite");
+    parameters.mass.resize(model.bodies.size());
+    parameters.inertia.resize(model.bodies.size());
+    for (int i = 0; i < model.body_count(); ++i) {
+        const double* inertia = in.inertia.at(0, scene) + 9 * i;
+        const Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>> given(inertia);
+        parameters.mass[i] = in.mass.at(0, scene)[i];
+        parameters.inertia[i] = 0.5 * (given + given.transpose());
+        if (!model.bodies[i].is_dynamic()) continue;
+        if (!(parameters.mass[i] > 0.0) || !std::isfinite(parameters.mass[i]))
+            refuse("mass", model, i, "must be positive and finite, got " + std::to_string(parameters.mass[i]) + " kg");
+        if (!parameters.inertia[i].allFinite() || parameters.inertia[i].llt().info() != Eigen::Success)
+            refuse("inertia", model, i, "must be positive definite");
+    }
+    return parameters;
+}
+
+void read_control(const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state,
+                  SceneControl& control) {
+    control.resize(model.bodies.size());
+    const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise) {
+        if (!view.present()) return otherwise;
+        const Vec3 value = row<3>(view.at(time, scene), body);
+        require_finite(field, model, body, value);
+        return value;
+    };
+    const Vec3 zero = Vec3::Zero();
+    for (int i = 0; i < model.body_count(); ++i) {
+        BodyControl& body = control[i];
+        if (model.bodies[i].kind == BodyKind::static_) continue;
+        if (model.bodies[i].kind == BodyKind::kinematic) {
+            body.velocity = read("control.body_velocity", in.body_velocity, i, state[i].velocity);
+            body.angular_velocity =
+                read("control.body_angular_velocity", in.body_angular_velocity, i, state[i].angular_velocity);
+            continue;
+        }
+        body.force = read("control.force", in.force, i, zero);
+        body.torque = read("control.torque", in.torque, i, zero);
+    }
+}
+
+void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene) {
+    for (int i = 0; i < static_cast<int>(state.size()); ++i) {
+        row<3>(out.position.at(time, scene), i) = state[i].position;
+        row<4>(out.orientation.at(time, scene), i) = state[i].orientation;
+        row<3>(out.velocity.at(time, scene), i) = state[i].velocity;
+        row<3>(out.angular_velocity.at(time, scene), i) = state[i].angular_velocity;
+    }
+}
+
+void merge_info(StepInfo& total, const StepInfo& scene) {
+    total.converged = total.converged && scene.converged;
+    total.contacts += scene.contacts;
+    total.zones += scene.zones;
+    total.largest_zone = std::max(total.largest_zone, scene.largest_zone);
+    total.iterations = std::max(total.iterations, scene.iterations);
+    total.residual = std::max(total.residual, scene.residual);
+    total.max_compression = std::max(total.max_compression, scene.max_compression);
+    total.seconds_motion += scene.seconds_motion;
+    total.seconds_broad_phase += scene.seconds_broad_phase;
+    total.seconds_zones += scene.seconds_zones;
+}
+
+// --- gradients -----------------------------------------------------------------------------------------------------
+
+/// Gradients of one scene, in the order of the inputs, controls for one step or for all.
+struct SceneGradient {
+    std::vector<BodyStateGradient> state;
+    std::vector<std::vector<BodyControlGradient>> control;  // per step
+    ParameterGradient parameters;
+};
+
+void add_upstream(const Tape& tape, const TrajectoryArrays<const double>& upstream, int time, int scene,
+                  const SceneState& end, std::vector<BodyStateGradient>& gradient) {
+    for (int i = 0; i < static_cast<int>(gradient.size()); ++i) {
+        BodyStateGradient& g = gradient[i];
+        if (upstream.position.present()) g.position += row<3>(upstream.position.at(time, scene), i);
+        if (upstream.velocity.present()) g.velocity += row<3>(upstream.velocity.at(time, scene), i);
+        if (upstream.angular_velocity.present())
+            g.angular_velocity += row<3>(upstream.angular_velocity.at(time, scene), i);
+        if (upstream.orientation.present())
+            g.orientation += quaternion_gradient_to_covector(end[i].orientation,
+                                                             row<4>(upstream.orientation.at(time, scene), i));
+    }
+    (void)tape;
+}
+
+/// State at the end of a recorded step: the start of the next one, or for the last step the same arithmetic again.
+SceneState end_state(const Tape& tape, int scene, int time) {
+    const std::vector<StepRecord>& records = tape.records[scene];
+    if (time + 1 < static_cast<int>(records.size())) return records[time + 1].start;
+    const StepRecord& record = records[time];
+    SceneState end = record.start;
+    for (std::size_t i = 0; i < end.size(); ++i) {
+        const Vec3 turn = record.y[i].head<3>();
+        if (turn.isZero(0.0)) continue;
+        end[i].orientation = quaternion_multiply(exp_quaternion(turn), end[i].orientation);
+        end[i].orientation /= end[i].orientation.norm();
+    }
+    return end;
+}
+
+SceneGradient scene_backward(const Tape& tape, const RolloutInputs& inputs,
+                             const TrajectoryArrays<const double>& upstream, int scene) {
+    const Model& model = *tape.model;
+    const std::size_t count = model.bodies.size();
+    const Parameters parameters = read_parameters(model, inputs, scene);
+    SceneGradient gradient;
+    gradient.state.resize(count);
+    gradient.control.resize(static_cast<std::size_t>(tape.shape.steps));
+    gradient.parameters.mass.assign(count, 0.0);
+    gradient.parameters.inertia.assign(count, Mat3::Zero());
+    StepWorkspace workspace;
+    SceneControl control;
+    for (int time = tape.shape.steps - 1; time >= 0; --time) {
+        const bool last = time == tape.shape.steps - 1;
+        if (tape.shape.keep_time || last)
+            add_upstream(tape, upstream, tape.shape.keep_time ? time : 0, scene, end_state(tape, scene, time),
+                         gradient.state);
+        const StepRecord& record = tape.records[scene][time];
+        read_control(model, inputs, time, scene, record.start, control);
+        std::vector<BodyControlGradient>& control_gradient = gradient.control[time];
+        control_gradient.resize(count);
+        step_backward(model, tape.options, parameters, control, record, workspace, gradient.state, control_gradient,
+                      gradient.parameters);
+        // Where a kinematic body was not driven, its own velocity drove it.
+        for (std::size_t i = 0; i < count; ++i) {
+            if (model.bodies[i].kind != BodyKind::kinematic) continue;
+            if (!inputs.body_velocity.present()) gradient.state[i].velocity += control_gradient[i].velocity;
+            if (!inputs.body_angular_velocity.present())
+                gradient.state[i].angular_velocity += control_gradient[i].angular_velocity;
+        }
+    }
+    return gradient;
+}
+
+void write_gradient(const Tape& tape, const RolloutInputs& inputs, const RolloutArrays<double>& out, int scene,
+                    const SceneGradient& gradient) {
+    const int count = tape.model->body_count();
+    const auto add3 = [](const BatchedView<double>& view, int time, int batch, int body, const Vec3& value) {
+        if (view.present()) row<3>(view.at(time, batch), body) += value;
+    };
+    for (int i = 0; i < count; ++i) {
+        const BodyStateGradient& g = gradient.state[i];
+        add3(out.position, 0, scene, i, g.position);
+        add3(out.velocity, 0, scene, i, g.velocity);
+        add3(out.angular_velocity, 0, scene, i, g.angular_velocity);
+        if (out.orientation.present()) {
+            const Vec4 given = row<4>(inputs.orientation.at(0, scene), i);
+            row<4>(out.orientation.at(0, scene), i) += covector_to_quaternion_gradient(given, g.orientation);
+        }
+        if (out.mass.present()) out.mass.at(0, scene)[i] += gradient.parameters.mass[i];
+        if (out.inertia.present())
+            Eigen::Map<Mat3>(out.inertia.at(0, scene) + 9 * i) += gradient.parameters.inertia[i];
+        const bool kinematic = tape.model->bodies[i].kind == BodyKind::kinematic;
+        for (int time = 0; time < tape.shape.steps; ++time) {
+            const BodyControlGradient& c = gradient.control[time][i];
+            if (kinematic) {
+                add3(out.body_velocity, time, scene, i, c.velocity);
+                add3(out.body_angular_velocity, time, scene, i, c.angular_velocity);
+            } else {
+                add3(out.force, time, scene, i, c.force);
+                add3(out.torque, time, scene, i, c.torque);
+            }
+        }
+    }
+    if (out.gravity.present()) row<3>(out.gravity.at(0, scene), 0) += gradient.parameters.gravity;
+}
+
+}  // namespace
+
+std::size_t Tape::bytes() const {
+    std::size_t total = sizeof(*this);
+    for (const auto& scene : records)
+        for (const StepRecord& record : scene) total += record.bytes();
+    return total;
+}
+
+RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
+                    const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory,
+                    std::vector<std::uint64_t>& signatures, Tape* tape, int thread_count) {
+    const auto begin = std::chrono::steady_clock::now();
+    if (tape != nullptr) {
+        tape->model = model;
+        tape->options = options;
+        tape->shape = shape;
+        tape->records.resize(static_cast<std::size_t>(shape.batch));
+        for (auto& records : tape->records) records.resize(static_cast<std::size_t>(shape.steps));
+    }
+    signatures.assign(static_cast<std::size_t>(shape.steps) * static_cast<std::size_t>(shape.batch), 0);
+    std::vector<RolloutInfo> infos(static_cast<std::size_t>(shape.batch));
+    for_each_scene(shape.batch, thread_count, [&](int scene, int) {
+        SceneState state = read_state(*model, inputs, scene);
+        const Parameters parameters = read_parameters(*model, inputs, scene);
+        StepWorkspace workspace;
+        SceneControl control;
+        RolloutInfo& info = infos[scene];
+        for (int time = 0; time < shape.steps; ++time) {
+            read_control(*model, inputs, time, scene, state, control);
+            StepRecord* record = tape != nullptr ? &tape->records[scene][time] : nullptr;
+            state = step(*model, options, parameters, state, control, workspace, info.last, record);
+            if (!info.last.converged) ++info.failed_steps;
+            signatures[static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +
+                       static_cast<std::size_t>(scene)] = info.last.signature;
+            if (shape.keep_time) write_state(state, trajectory, time, scene);
+        }
+        if (!shape.keep_time) write_state(state, trajectory, 0, scene);
+    });
+    RolloutInfo total;
+    for (const RolloutInfo& info : infos) {
+        total.failed_steps += info.failed_steps;
+        merge_info(total.last, info.last);
+    }
+    total.converged = total.failed_steps == 0;
+    total.seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
+    return total;
+}
+
+void rollout_backward(const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
+                      const RolloutArrays<double>& gradient, int thread_count) {
+    std::vector<SceneGradient> scenes(static_cast<std::size_t>(tape.shape.batch));
+    for_each_scene(tape.shape.batch, thread_count,
+                   [&](int scene, int) { scenes[scene] = scene_backward(tape, inputs, upstream, scene); });
+    // Inputs that scenes share get the sum over the scenes, in their order.
+    for (int scene = 0; scene < tape.shape.batch; ++scene) write_gradient(tape, inputs, gradient, scene, scenes[scene]);
+}
+
+}  // namespace diffsim
