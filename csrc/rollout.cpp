@@ -88,7 +88,7 @@ SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
         if (!(std::abs(norm - 1.0) <= kUnitTolerance))
             refuse("state.orientation", model, i,
                    "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) + "; divide it by its norm");
-        body.orientation /= norm;
+        if (std::abs(norm - 1.0) > 4.0 * kEpsilon) body.orientation /= norm;  // bits of our own states stay
     }
     return state;
 }
@@ -125,15 +125,11 @@ void read_control(const Model& model, const RolloutInputs& in, int time, int sce
     const Vec3 zero = Vec3::Zero();
     for (int i = 0; i < model.body_count(); ++i) {
         BodyControl& body = control[i];
-        if (model.bodies[i].kind == BodyKind::static_) continue;
-        if (model.bodies[i].kind == BodyKind::kinematic) {
-            body.velocity = read("control.body_velocity", in.body_velocity, i, state[i].velocity);
-            body.angular_velocity =
-                read("control.body_angular_velocity", in.body_angular_velocity, i, state[i].angular_velocity);
-            continue;
-        }
         body.force = read("control.force", in.force, i, zero);
         body.torque = read("control.torque", in.torque, i, zero);
+        body.velocity = read("control.body_velocity", in.body_velocity, i, state[i].velocity);
+        body.angular_velocity =
+            read("control.body_angular_velocity", in.body_angular_velocity, i, state[i].angular_velocity);
     }
 }
 
@@ -297,7 +293,7 @@ RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& op
             read_control(*model, inputs, time, scene, state, control);
             StepRecord* record = tape != nullptr ? &tape->records[scene][time] : nullptr;
             state = step(*model, options, parameters, state, control, workspace, info.last, record);
-            if (!info.last.converged) ++info.failed_steps;
+            if (!info.last.converged && info.failed_steps++ == 0) info.status = info.last.status;
             signatures[static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +
                        static_cast<std::size_t>(scene)] = info.last.signature;
             if (shape.keep_time) write_state(state, trajectory, time, scene);
@@ -306,6 +302,7 @@ RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& op
     });
     RolloutInfo total;
     for (const RolloutInfo& info : infos) {
+        if (total.status == ZoneStatus::converged) total.status = info.status;
         total.failed_steps += info.failed_steps;
         merge_info(total.last, info.last);
     }

@@ -54,6 +54,7 @@ struct Tape {
 struct RolloutInfo {
     bool converged = true;
     int failed_steps = 0;
+    ZoneStatus status = ZoneStatus::converged;  ///< of the first step that failed, in the first scene where one did
     StepInfo last;  ///< of the last step: counts summed over the batch, other numbers the largest
     double seconds = 0.0;
 };

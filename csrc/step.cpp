@@ -8,6 +8,7 @@
 #include <stdexcept>
 
 #include "contact/adjoint.hpp"
+#include "contact/separation.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
@@ -301,6 +302,7 @@ private:
     /// What drives could not do for one zone they must not do for any.
     void shorten_drives(bool stop) {
         m_info.converged = false;
+        m_info.status = ZoneStatus::blocked;
         for (const auto& [body, reached] : m_blocked) {
             if (stop || reached.squaredNorm() < m_y[body].squaredNorm()) m_y[body] = stop ? Vec6(Vec6::Zero()) : reached;
         }
@@ -337,7 +339,10 @@ private:
         for (int root : m_box_bodies) {
             const ZoneOutcome& outcome = m_outcomes[root];
             if (outcome.bodies.empty() || outcome.free) continue;
-            m_info.converged = m_info.converged && outcome.result.status == ZoneStatus::converged;
+            if (outcome.result.status != ZoneStatus::converged) {
+                m_info.converged = false;
+                if (m_info.status == ZoneStatus::converged) m_info.status = outcome.result.status;
+            }
             m_info.iterations = std::max(m_info.iterations, outcome.result.iterations);
             m_info.residual = std::max(m_info.residual, outcome.result.residual);
             m_info.max_compression = std::max(m_info.max_compression, outcome.max_compression);
@@ -657,6 +662,45 @@ void step_backward(const Model& model, const Options& options, const Parameters&
     StepBackward(model, options, parameters, control, record, workspace, gradient, control_gradient,
                  parameter_gradient)
         .run();
+}
+
+SceneState separate_state(const Model& model, const Options& options, const Parameters& parameters,
+                          const SceneState& state) {
+    Zone zone;
+    zone.model = &model;
+    zone.compliance = options.compliance;
+    zone.ground_height = model.ground.height;
+    PassiveBodies passive;
+    std::vector<Box> boxes;
+    for (int i = 0; i < model.body_count(); ++i) {
+        const Pose pose{quaternion_to_matrix(state[i].orientation), state[i].position};
+        if (!model.bodies[i].is_dynamic()) {
+            passive.bodies.push_back({i, pose, Vec6::Zero()});
+            boxes.push_back(swept_box({&model.bodies[i].mesh, {pose, pose}, model.bodies[i].margin}));
+            continue;
+        }
+        ZoneBody body;
+        body.id = i;
+        body.start = pose;
+        body.mass = parameters.mass[i];
+        body.inertia = pose.R * parameters.inertia[i] * pose.R.transpose();
+        body.inverse_inertia = body.inertia.inverse();
+        zone.bodies.push_back(body);
+    }
+    passive.tree = build_box_tree(boxes);
+    zone.dynamic_count = zone.body_count();
+    if (zone.bodies.empty()) return state;
+    const Separation separation = separate(zone, passive);
+    SceneState result = state;
+    for (std::size_t k = 0; k < separation.poses.size(); ++k) {
+        const Pose &from = zone.bodies[k].start, &to = separation.poses[k];
+        BodyState& body = result[zone.bodies[k].id];
+        body.position = to.t;
+        const Mat3 turn = to.R * from.R.transpose();
+        if (turn.isIdentity(4.0 * kEpsilon)) continue;
+        body.orientation = quaternion_multiply(exp_quaternion(log_rotation(turn)), body.orientation).normalized();
+    }
+    return result;
 }
 
 NearestObjects nearest_objects(const Model& model, const SceneState& state) {

@@ -24,6 +24,7 @@ struct StepRecord {
 
 struct StepInfo {
     bool converged = true;
+    ZoneStatus status = ZoneStatus::converged;  ///< of the first zone that did not converge
     int contacts = 0;
     int zones = 0;         ///< groups of bodies in contact
     int largest_zone = 0;  ///< bodies
@@ -60,6 +61,10 @@ void step_backward(const Model& model, const Options& options, const Parameters&
                    const SceneControl& control, const StepRecord& record, StepWorkspace& workspace,
                    std::vector<BodyStateGradient>& gradient, std::vector<BodyControlGradient>& control_gradient,
                    ParameterGradient& parameter_gradient);
+
+/// The state with dynamic bodies that touch, or are nearer than they rest, moved apart (contact/separation.hpp).
+SceneState separate_state(const Model& model, const Options& options, const Parameters& parameters,
+                          const SceneState& state);
 
 /// Smallest distance between the collision surfaces of any two objects, at least one of which is dynamic or kinematic.
 struct NearestObjects {

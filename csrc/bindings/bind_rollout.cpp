@@ -228,6 +228,45 @@ py::tuple bound_min_distance(const Model& model, const Array& position, const Ar
     return py::make_tuple(nearest.distance, nearest.a, nearest.b);
 }
 
+py::tuple bound_separate(const Model& model, const Options& options, const Array& position, const Array& orientation,
+                         const Array& mass, const Array& inertia) {
+    const py::ssize_t n = model.body_count();
+    const SceneState state = scene_state(model, position, orientation);
+    if (shape_of(mass) != Shape{n} || shape_of(inertia) != Shape{n, 3, 3})
+        throw std::invalid_argument("mass and inertia must have shapes (n_bodies,) and (n_bodies, 3, 3)");
+    Parameters parameters;
+    for (py::ssize_t i = 0; i < n; ++i) {
+        parameters.mass.push_back(mass.at(i));
+        parameters.inertia.emplace_back(Eigen::Map<const Mat3>(inertia.data(i, 0, 0)));
+    }
+    const SceneState moved = separate_state(model, options, parameters, state);
+    Array new_position(Shape{n, 3}), new_orientation(Shape{n, 4});
+    double max_shift = 0.0;
+    for (py::ssize_t i = 0; i < n; ++i) {
+        max_shift = std::max(max_shift, (moved[i].position - state[i].position).norm());
+        for (int k = 0; k < 3; ++k) new_position.mutable_at(i, k) = moved[i].position[k];
+        for (int k = 0; k < 4; ++k) new_orientation.mutable_at(i, k) = moved[i].orientation[k];
+    }
+    return py::make_tuple(new_position, new_orientation, max_shift);
+}
+
+/// Why a step did not converge, or nothing.
+const char* failure_text(ZoneStatus status) {
+    switch (status) {
+        case ZoneStatus::converged:
+            return "";
+        case ZoneStatus::too_many_iterations:
+            return "max_iterations reached";
+        case ZoneStatus::no_descent:
+            return "no step lowers the energy";
+        case ZoneStatus::blocked:
+            return "a driven body is blocked: something is squeezed";
+        case ZoneStatus::bad_start:
+            return "objects penetrate at the start";
+    }
+    return "";
+}
+
 py::dict milliseconds(const RolloutInfo& info) {
     py::dict result;
     result["motion"] = 1e3 * info.last.seconds_motion;
@@ -246,6 +285,7 @@ void bind_rollout(py::module_& module) {
     py::class_<RolloutInfo>(module, "Info", "Statistics of a rollout; counts are those of its last step.")
         .def_readonly("converged", &RolloutInfo::converged)
         .def_readonly("failed_steps", &RolloutInfo::failed_steps)
+        .def_property_readonly("failure", [](const RolloutInfo& info) { return failure_text(info.status); })
         .def_property_readonly("contacts", [](const RolloutInfo& info) { return info.last.contacts; })
         .def_property_readonly("zones", [](const RolloutInfo& info) { return info.last.zones; })
         .def_property_readonly("largest_zone", [](const RolloutInfo& info) { return info.last.largest_zone; })
@@ -279,6 +319,10 @@ void bind_rollout(py::module_& module) {
                py::arg("inertia").noconvert(), py::arg("gravity").noconvert(), py::arg("grad_position").noconvert().none(true), py::arg("grad_orientation").noconvert().none(true),
                py::arg("grad_velocity").noconvert().none(true),
                py::arg("grad_angular_velocity").noconvert().none(true), py::arg("needs"), py::arg("num_threads"));
+
+    module.def("separate", &bound_separate, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
+               py::arg("orientation").noconvert(), py::arg("mass").noconvert(), py::arg("inertia").noconvert(),
+               "Move dynamic bodies apart to their rest distance: (position, orientation, largest shift [m]).");
 
     module.def("min_distance", &bound_min_distance, py::arg("model"), py::arg("position").noconvert(),
                py::arg("orientation").noconvert());

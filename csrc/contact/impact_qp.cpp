@@ -9,6 +9,9 @@ namespace {
 constexpr int kMaxRounds = 40;
 constexpr int kMaxNewtonSteps = 100;
 constexpr double kQpTolerance = 1e-9;  // of the starting gradient: a search direction needs no more
+constexpr double kMaxTurn = 0.5;      // [rad] in one direction: rows hold their meaning over that
+constexpr int kMaxTurnLimits = 5;
+constexpr double kNearby = 2.0;  // pairs this many contact ranges away are rows from the start
 constexpr double kImpactWindow = 0.5;  // later impacts of two bodies count up to this part of the smaller radius
 
 double dot(const Coordinates& a, const Coordinates& b, int count) {
@@ -87,8 +90,8 @@ std::pair<int, int> objects(const ZoneContact& contact) { return {contact.a, con
 
 }  // namespace
 
-int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, const std::vector<ImpactRow>& rows,
-                    BlockSystem& system, Coordinates& p) {
+int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, const std::vector<double>& mass_factor,
+                    const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p) {
     const int count = zone.dynamic_count;
     Coordinates gradient(static_cast<std::size_t>(count)), step(static_cast<std::size_t>(count));
     std::vector<double> violation(rows.size()), slope(rows.size());
@@ -98,9 +101,9 @@ int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, cons
         system.set_zero();
         for (int i = 0; i < count; ++i) {
             const ZoneBody& body = zone.bodies[i];
-            gradient[i] = mass_times(body, p[i]) + inertial_gradient[i];
-            system.diagonal(i).topLeftCorner<3, 3>() = body.inertia;
-            system.diagonal(i).diagonal().tail<3>().setConstant(body.mass);
+            gradient[i] = mass_factor[i] * mass_times(body, p[i]) + inertial_gradient[i];
+            system.diagonal(i).topLeftCorner<3, 3>() = mass_factor[i] * body.inertia;
+            system.diagonal(i).diagonal().tail<3>().setConstant(mass_factor[i] * body.mass);
         }
         for (std::size_t r = 0; r < rows.size(); ++r) {
             const ImpactRow& row = rows[r];
@@ -127,7 +130,7 @@ int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, cons
         for (std::size_t r = 0; r < rows.size(); ++r) slope[r] = row_times(rows[r], step);
         double first = 0.0, second = 0.0;  // of the inertial part along the step
         for (int i = 0; i < count; ++i) {
-            const Vec6 mass_step = mass_times(zone.bodies[i], step[i]);
+            const Vec6 mass_step = mass_factor[i] * mass_times(zone.bodies[i], step[i]);
             first += step[i].dot(inertial_gradient[i]) + p[i].dot(mass_step);
             second += step[i].dot(mass_step);
         }
@@ -138,6 +141,28 @@ int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, cons
     return k;
 }
 
+namespace {
+
+/// Solve the QP, and again with more mass for bodies that would turn too far.
+int solve_with_limited_turns(const Zone& zone, const Coordinates& inertial_gradient, std::vector<double>& mass_factor,
+                             const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p) {
+    int newton_steps = 0;
+    for (int k = 0; k < kMaxTurnLimits; ++k) {
+        newton_steps += solve_impact_qp(zone, inertial_gradient, mass_factor, rows, system, p);
+        bool limited = false;
+        for (int i = 0; i < zone.dynamic_count; ++i) {
+            const double turn = p[i].head<3>().norm();
+            if (turn <= 1.1 * kMaxTurn) continue;
+            mass_factor[i] *= turn / kMaxTurn;
+            limited = true;
+        }
+        if (!limited) break;
+    }
+    return newton_steps;
+}
+
+}  // namespace
+
 ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, BlockSystem& system) {
     const int count = zone.dynamic_count;
     const std::size_t total = static_cast<std::size_t>(zone.body_count());
@@ -145,12 +170,19 @@ ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, Block
     for (int i = 0; i < count; ++i) inertial_gradient[i] = mass_times(zone.bodies[i], point.y[i] - zone.bodies[i].target);
 
     std::vector<ImpactRow> rows;
-    for (const ActiveContact& active : point.active) {
-        const ZoneContact& contact = zone.contacts[active.index];
-        ImpactRow row = make_row(zone, contact, active.geometry, point.poses, point.y);
-        row.missing = contact.range.rest - active.geometry.distance;
-        // Where the partner is driven, its motion is given.
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
+        const ZoneContact& contact = zone.contacts[k];
+        const double nearby = contact.range.rest + kNearby * (contact.range.rest - contact.range.floor);
+        if (!(point.distances[k] < nearby)) continue;
         const bool ground = contact.contact.with_ground();
+        const Pose& pose_a = point.poses[contact.a];
+        const ContactGeometry geometry = contact_geometry(
+            *zone.model, contact.contact, pose_a, ground ? pose_a : point.poses[contact.b], zone.ground_height);
+        if (geometry.sine_sq < kParallelLimit) continue;
+        ImpactRow row = make_row(zone, contact, geometry, point.poses, point.y);
+        const bool pushes = geometry.distance < contact.range.rest;
+        row.missing = (pushes ? contact.range.rest : contact.range.landing) - geometry.distance;
+        // Where the partner is driven, its motion is given.
         if (row.a < 0) row.missing -= row.row_a.dot(zone.bodies[contact.a].target - point.y[contact.a]);
         if (!ground && row.b < 0) row.missing -= row.row_b.dot(zone.bodies[contact.b].target - point.y[contact.b]);
         rows.push_back(row);
@@ -164,7 +196,8 @@ ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, Block
     std::vector<Impact> impacts;
     Coordinates y_end(total), y_impact(total);
     std::vector<Pose> poses(total);
-    int newton_steps = rows.empty() ? 0 : solve_impact_qp(zone, inertial_gradient, rows, system, p);
+    std::vector<double> mass_factor(static_cast<std::size_t>(count), 1.0);
+    int newton_steps = solve_with_limited_turns(zone, inertial_gradient, mass_factor, rows, system, p);
     for (int round = 0; round < kMaxRounds; ++round) {
         for (int i = 0; i < zone.body_count(); ++i)
             y_end[i] = i < count ? Vec6(point.y[i] + p[i]) : zone.bodies[i].target;
@@ -223,7 +256,7 @@ ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, Block
             added = true;
         }
         if (!added) break;
-        newton_steps += solve_impact_qp(zone, inertial_gradient, rows, system, p);
+        newton_steps += solve_with_limited_turns(zone, inertial_gradient, mass_factor, rows, system, p);
     }
     best.newton_steps = newton_steps;
     return best;

@@ -103,7 +103,7 @@ private:
     double clear_step(const Coordinates& y_end) {
         double step = 1.0;
         m_w.trial.y = y_end;
-        for (int k = 0; k < 20; ++k) {
+        for (int k = 0; k < kMaxHalvings; ++k) {
             const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
             if (allowed == 1.0) {
                 evaluate(m_zone, m_w.trial);
@@ -207,7 +207,7 @@ private:
         const double slope0 = slope(m_w.derivatives.gradient);
         const double noise = energy_noise();
         double step = first_step;
-        for (int k = 0; k < kMaxHalvings; ++k, step *= 0.5) {
+        for (int k = 0; k < kMaxHalvings && step > 0.0; ++k, step *= 0.5) {
             if (step == 1.0)
                 m_w.trial.y = m_w.y_end;
             else
@@ -277,24 +277,27 @@ private:
         m_w.y_end = direction.y_end;
         m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
         const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
-        if (good) return arc_step(direction.step);
+        if (good) return covered_step();
         m_w.y_end = newton_end;
-        for (int i = static_cast<int>(newton_end.size()); i < m_zone.body_count(); ++i)
-            m_w.y_end.push_back(m_zone.bodies[i].target);
-        return arc_step(newton_limit);
+        m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
+        for (std::size_t i = newton_end.size(); i < m_w.y_end.size(); ++i) m_w.y_end[i] = m_zone.bodies[i].target;
+        return covered_step();
+    }
+
+    /// The allowed step to m_w.y_end, with the list of contacts complete for it.
+    double covered_step() {
+        ensure_covered(m_w.y_end);
+        return arc_step(1.0);
     }
 
     /// Shorten a step until the chords to its end are clear.
     double arc_step(double step) {
-        for (int k = 0; k < 20 && step > 0.0; ++k) {
-            m_w.trial.y.resize(m_w.y_end.size());
-            if (step == 1.0)
-                m_w.trial.y = m_w.y_end;
-            else
-                set_trial(m_w.y_end, step);
+        for (int k = 0; k < kMaxHalvings && step > 0.0; ++k) {
+            m_w.trial.y = m_w.y_end;
+            if (step < 1.0) set_trial(m_w.y_end, step);
             const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
             if (allowed == 1.0) return step;
-            step *= allowed;
+            step *= std::min(allowed, 0.9);
         }
         return 0.0;
     }

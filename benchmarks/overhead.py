@@ -1,0 +1,93 @@
+"""What a step costs beside its physics: one free body, one step, called from Python.
+
+Timed beside a do-nothing autograd.Function of the same arity (11 tensors in, 4 out), in turns, in the same process:
+forward through `Simulator.__call__` with gradients recorded, and backward to the whole state. Prints one CSV line per
+run; the ratios should be at most 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import diffsim as ds
+
+COLUMNS = ("run", "nothing_forward_us", "step_forward_us", "forward_ratio")
+COLUMNS += ("nothing_backward_us", "step_backward_us", "backward_ratio")
+
+
+class Nothing(torch.autograd.Function):
+    """As `diffsim.ops` has it: an object and 11 tensors (or None) in, 4 tensors out."""
+
+    @staticmethod
+    def forward(call: object, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        return tuple(t.clone() for t in inputs[:4] if t is not None)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.save_for_backward(*inputs[1:])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, *grads, *(None,) * 7)
+
+
+def cases() -> dict[str, Callable[[], object]]:
+    """Name -> the call to be timed."""
+    scene = ds.Scene()
+    scene.add_sphere(0.5, density=1000.0, angular_velocity=(1.0, 2.0, 3.0))
+    sim = ds.Simulator(scene, dt=0.01)
+    start = sim.initial_state()
+    inputs = [t.requires_grad_() for t in (start.position, start.orientation, start.velocity, start.angular_velocity)]
+    arguments = (object(), *inputs, None, None, None, None, sim.mass, sim.inertia, sim.gravity)
+    end = sim(start)
+    stepped = (end.position, end.orientation, end.velocity, end.angular_velocity)
+    unchanged = Nothing.apply(*arguments)
+    upstream = [torch.ones_like(t) for t in stepped]
+    return {
+        "nothing_forward": lambda: Nothing.apply(*arguments),
+        "step_forward": lambda: sim(start),
+        "nothing_backward": lambda: torch.autograd.grad(unchanged, inputs, upstream, retain_graph=True),
+        "step_backward": lambda: torch.autograd.grad(stepped, inputs, upstream, retain_graph=True),
+    }
+
+
+def microseconds(call: Callable[[], object], repeats: int) -> float:
+    start = time.perf_counter_ns()
+    for _ in range(repeats):
+        call()
+    return (time.perf_counter_ns() - start) / repeats / 1e3
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=21, help="per run; the median of them is printed")
+    parser.add_argument("--repeats", type=int, default=500, help="calls per round")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    timed = cases()
+    print(",".join(COLUMNS))
+    for run in range(options.runs):
+        rounds: dict[str, list[float]] = {name: [] for name in timed}
+        for _ in range(options.rounds):
+            for name, call in timed.items():
+                rounds[name].append(microseconds(call, options.repeats))
+        us = {name: statistics.median(values) for name, values in rounds.items()}
+        values = []
+        for direction in ("forward", "backward"):
+            nothing, step = us[f"nothing_{direction}"], us[f"step_{direction}"]
+            values += [nothing, step, step / nothing]
+        print(run, *(f"{value:.2f}" for value in values), sep=",", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

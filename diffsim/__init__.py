@@ -1,0 +1,31 @@
+"""Differentiable simulation of triangle meshes in contact, as a PyTorch layer."""
+
+from typing import Any
+
+from . import diagnostics, rotation, shapes
+from .ops import ConvergenceWarning, Info, SolverError
+from .scene import BodyHandle, Scene
+from .simulator import Simulator
+from .state import Control, State
+
+__all__ = [
+    "BodyHandle",
+    "Control",
+    "ConvergenceWarning",
+    "Info",
+    "Scene",
+    "Simulator",
+    "SolverError",
+    "State",
+    "diagnostics",
+    "rotation",
+    "shapes",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("mesh-diffsim")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,147 @@
+"""The forms that state, controls and parameters may take, turned into the float64 tensors of the operator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ._check import (
+    CONTROL_FIELDS,
+    STATE_FIELDS,
+    check_control,
+    check_float_tensor,
+    check_instance,
+    check_shape,
+    check_state,
+    message,
+)
+from .state import Control
+
+Controls = Control | Sequence[Control] | None
+Inputs = tuple[Tensor | None, ...]  #: of the operator: 4 of the state, 4 of the control, mass, inertia, gravity
+
+
+def checked_inputs(
+    where: str,
+    state: Any,
+    controls: Any,
+    parameters: tuple[Tensor, Tensor, Tensor],
+    steps: int | None,
+    body_count: int,
+    node_count: int,
+) -> tuple[Inputs, bool]:
+    """The operator's inputs from anything that is allowed, or an error that says why not.
+
+    Args:
+        where: Who is asking, for error messages.
+        state: As for `Simulator.forward`.
+        controls: As for `Simulator.rollout`, or with `steps` None as for `Simulator.forward`.
+        parameters: mass, inertia, gravity.
+        steps: Of the rollout; None for a step.
+        body_count: n_bodies.
+        node_count: n_nodes.
+    Returns: The inputs, and whether the controls among them have a time axis.
+    """
+    batch = check_state(where, state, body_count, node_count)
+    now = [getattr(state, name) for name in STATE_FIELDS]
+    if batch is not None:
+        now = [t.expand(batch, *t.shape[-2:]) for t in now]
+    checked, batch = _parameters(where, parameters, body_count, batch)
+    driven: list[Tensor | None] = [None] * len(CONTROL_FIELDS)
+    has_time = False
+    if steps is not None:
+        driven, has_time, batch = over_time(where, controls, steps, state.dtype, body_count, node_count, batch)
+    elif controls is not None:
+        check_control(where, controls, state.dtype, body_count, node_count, batch)
+        driven = [getattr(controls, name) for name in CONTROL_FIELDS]
+    return tuple(None if t is None else t.to(torch.float64) for t in (*now, *driven, *checked)), has_time
+
+
+def over_time(
+    where: str, controls: Any, steps: int, dtype: torch.dtype, body_count: int, node_count: int, batch: int | None
+) -> tuple[list[Tensor | None], bool, int | None]:
+    """The four body controls, in the order of the core; whether they have a time axis; the batch size known now."""
+    if controls is None:
+        return [None] * len(CONTROL_FIELDS), False, batch
+    if isinstance(controls, Sequence) and not isinstance(controls, (str, bytes)):
+        return _stacked(where, controls, steps, dtype, body_count, node_count, batch)
+    check_instance(where, "controls", controls, Control, "be None, a diffsim.Control or a sequence of them")
+    arranged: dict[str, tuple[Tensor | None, bool]] = {}
+    for name, value in controls.__dict__.items():
+        arranged[name] = None, False
+        if value is not None:
+            tensor = check_float_tensor(where, f"controls.{name}", value, dtype)
+            shape = (node_count if name.startswith("node") else body_count, 3)
+            tensor, has_time, batch = _arranged(where, f"controls.{name}", tensor, steps, shape, batch)
+            arranged[name] = tensor, has_time
+    fields = [arranged[name] for name in CONTROL_FIELDS]
+    if not any(has_time for _, has_time in fields):
+        return [t for t, _ in fields], False, batch
+    return [t if t is None or has_time else t.expand(steps, *t.shape) for t, has_time in fields], True, batch
+
+
+def _arranged(
+    where: str, name: str, t: Tensor, steps: int, shape: tuple[int, int], batch: int | None
+) -> tuple[Tensor, bool, int | None]:
+    """([steps,] [B,] n, 3): which of its leading axes is time, and the batch size known now."""
+    got, (count, width) = tuple(t.shape), shape
+    if t.ndim <= 2 or (t.ndim == 3 and batch is not None and got[0] != steps):
+        if got == shape or (t.ndim == 3 and got == (batch, *shape)):
+            return t, False, batch
+    elif t.ndim == 3 and got == (steps, *shape):
+        if steps == batch:
+            raise ValueError(
+                f"{where}: {name} of shape {got} is ambiguous, because there are as many steps as scenes in the batch;"
+                f" write {name}[:, None] if its first axis is time, {name}[None] if it is the batch"
+            )
+        return t, True, batch
+    elif t.ndim == 4 and got[2:] == shape and got[0] in (1, steps) and (batch is None or got[1] in (1, batch)):
+        batch = got[1] if batch is None else batch
+        return t.expand(steps, batch, count, width), True, batch
+    size = "B" if batch is None else batch
+    forms = [f"({count}, 3)", f"({steps}, {count}, 3)", f"({steps}, {size}, {count}, 3)"]
+    if batch is not None:
+        forms.insert(1, f"({batch}, {count}, 3)")
+    raise ValueError(message(where, name, f"have shape {', '.join(forms[:-1])} or {forms[-1]}", got))
+
+
+def _stacked(
+    where: str,
+    controls: Sequence[Any],
+    steps: int,
+    dtype: torch.dtype,
+    body_count: int,
+    node_count: int,
+    batch: int | None,
+) -> tuple[list[Tensor | None], bool, int | None]:
+    if len(controls) != steps:
+        raise ValueError(message(where, "controls", f"have one entry per step, {steps}", len(controls)))
+    for step, control in enumerate(controls):
+        batch = check_control(f"{where}: controls[{step}]", control, dtype, body_count, node_count, batch)
+    stacked: list[Tensor | None] = []
+    for name in CONTROL_FIELDS:
+        column = [getattr(control, name) for control in controls]
+        given = [t for t in column if t is not None]
+        if len(given) not in (0, steps):
+            if name.startswith("body"):  # None is not zero here, but "as it goes"
+                step = next(i for i, t in enumerate(column) if t is None)
+                raise ValueError(
+                    f"{where}: controls[{step}].{name} is None, others are not; give it in all steps or none"
+                )
+            column = [torch.zeros(body_count, 3, dtype=dtype) if t is None else t for t in column]
+        stacked.append(torch.stack(torch.broadcast_tensors(*column)) if given else None)
+    return stacked, any(t is not None for t in stacked), batch
+
+
+def _parameters(
+    where: str, parameters: tuple[Any, Any, Any], body_count: int, batch: int | None
+) -> tuple[list[Tensor], int | None]:
+    shapes = {"mass": (body_count,), "inertia": (body_count, 3, 3), "gravity": (3,)}
+    checked = []
+    for value, (name, shape) in zip(parameters, shapes.items()):
+        checked.append(check_float_tensor(where, name, value))
+        batch = check_shape(where, name, checked[-1], shape, batch)
+    return checked, batch

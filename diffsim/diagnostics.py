@@ -1,0 +1,233 @@
+"""Checks a user can run on a scene of their own: are the gradients right?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ._check import CONTROL_FIELDS, STATE_FIELDS, check_count, check_instance, check_number
+from ._inputs import Controls, over_time
+from .simulator import Simulator
+from .state import Control, State
+
+__all__ = ["DirectionCheck", "GradcheckReport", "gradcheck"]
+
+_PARAMETERS = ("mass", "inertia", "gravity")
+
+# Mass and inertia are moved by this many times eps, relative to their size: their effect on the motion is weaker than
+# that of the state, and rounding would be read as an error of 1e-5.
+_PARAMETER_STEP = 100.0
+# A derivative below this fraction of the typical one is judged as if it were that large: the rest is rounding.
+_SMALL = 1e-3
+
+
+@dataclass(frozen=True)
+class DirectionCheck:
+    """One direction: the layer's derivative beside central differences."""
+
+    name: str  #: what was moved: "position", "force", "mass", ...
+    derivative: float  #: by the layer's gradient
+    difference: float  #: by central differences
+    error: float  #: |derivative - difference| / max(|derivative|, |difference|, a thousandth of the typical derivative)
+    active_set_changed: bool  #: the contacts of some step differ between the two sides: the difference means nothing
+
+
+@dataclass(frozen=True)
+class GradcheckReport:
+    """What `gradcheck` found. Print it for a table."""
+
+    directions: tuple[DirectionCheck, ...]
+    zero_gradients: tuple[str, ...]  #: names whose gradient is zero: nothing was tested there
+    steps: int
+    eps: float
+    median_tolerance: float
+    max_tolerance: float
+
+    @property
+    def stable(self) -> tuple[DirectionCheck, ...]:
+        """The directions whose two sides have the same active contacts."""
+        return tuple(d for d in self.directions if not d.active_set_changed)
+
+    @property
+    def max_error(self) -> float:
+        """Largest relative error over the stable directions; nan if there is none."""
+        return max((d.error for d in self.stable), default=math.nan)
+
+    @property
+    def median_error(self) -> float:
+        """Median relative error over the stable directions; nan if there is none."""
+        return median(d.error for d in self.stable) if self.stable else math.nan
+
+    @property
+    def passed(self) -> bool:
+        """Some gradient is not zero, and median and maximum of the error are within their tolerances."""
+        tested = any(d.derivative != 0.0 for d in self.stable)
+        return tested and self.median_error <= self.median_tolerance and self.max_error <= self.max_tolerance
+
+    def __str__(self) -> str:
+        head = f"{'input':<22}{'derivative':>16}{'difference':>16}{'error':>10}  active set"
+        rows = [
+            f"{d.name:<22}{d.derivative:>16.8e}{d.difference:>16.8e}{d.error:>10.1e}"
+            f"  {'changed' if d.active_set_changed else 'same'}"
+            for d in self.directions
+        ]
+        zero = [f"gradient is zero, nothing tested: {', '.join(self.zero_gradients)}"] if self.zero_gradients else []
+        verdict = (
+            f"{'passed' if self.passed else 'FAILED'}: {self.steps} step(s), eps {self.eps:g}, {len(self.stable)} of"
+            f" {len(self.directions)} directions with an unchanged active set; error median {self.median_error:.1e}"
+            f" (tolerance {self.median_tolerance:g}), max {self.max_error:.1e} (tolerance {self.max_tolerance:g})"
+        )
+        return "\n".join([head, *rows, *zero, verdict])
+
+
+class _Rollout(nn.Module):
+    """A rollout as a module's forward, so that functional_call can exchange parameters in it."""
+
+    def __init__(self, sim: Simulator) -> None:
+        super().__init__()
+        self.sim = sim
+
+    def forward(self, state: State, control: Controls, steps: int) -> tuple[State, NDArray[np.uint64]]:
+        trajectory, signature = self.sim._rollout(state, control, steps, want_signature=True)
+        assert signature is not None  # it was asked for
+        return trajectory[-1], signature
+
+
+def gradcheck(
+    sim: Simulator,
+    state: State,
+    controls: Controls = None,
+    steps: int = 1,
+    *,
+    wrt: Sequence[str] | None = None,
+    directions: int = 4,
+    eps: float = 1e-6,
+    seed: int = 0,
+    loss: Callable[[State], Tensor] | None = None,
+    median_tolerance: float = 1e-6,
+    max_tolerance: float = 1e-4,
+) -> GradcheckReport:
+    """Compare the layer's gradient of a scalar of the final state with central differences, along random directions.
+
+    A step with contact is smooth only while the set of active contacts stays: a direction along which it changes
+    between the two sides is reported as such and not judged.
+
+    Args:
+        sim: The simulator; its parameters are left as they are.
+        state: Where to start; copied to float64.
+        controls: As for `Simulator.rollout`.
+        steps: Number of steps.
+        wrt: Names of what to move: fields of the state, of the controls, or "mass", "inertia", "gravity". Default: all
+            of the state, the controls that are given, and the parameters.
+        directions: Random directions per name.
+        eps: How far to either side: of positions, velocities and quaternions (along the tangent of the unit sphere) in
+            their units; forces, torques and gravity as far as changes velocities by eps in a step; mass and inertia by
+            100 eps of their value.
+        seed: Of the directions and of the default loss.
+        loss: Final state -> scalar tensor. Default: a sum over all entries of the final state with random weights.
+        median_tolerance: The largest median error with which `GradcheckReport.passed`.
+        max_tolerance: The largest error with which it does.
+    Returns: The report, one entry per direction.
+    Raises: ValueError, TypeError as `Simulator.rollout`, and for a name in `wrt` that there is nothing of.
+    """
+    where = "gradcheck"
+    check_instance(where, "sim", sim, Simulator, "be a diffsim.Simulator")
+    check_instance(where, "state", state, State, "be a diffsim.State")
+    directions = check_count(where, "directions", directions)
+    eps = check_number(where, "eps", eps, above=0.0)
+    generator = torch.Generator().manual_seed(seed)
+    inputs = _inputs(where, sim, state, controls, check_count(where, "steps", steps))
+    names = list(inputs) if wrt is None else list(wrt)
+    for name in names:
+        if name not in inputs:
+            raise ValueError(f"{where}: wrt must hold names out of {', '.join(inputs)}, got {name!r}")
+    if loss is None:
+        weights = {name: _normal(inputs[name].shape, generator) for name in STATE_FIELDS}
+
+        def random_loss(final: State) -> Tensor:
+            return torch.stack([(getattr(final, name) * w).sum() for name, w in weights.items()]).sum()
+
+        loss = random_loss
+    module = _Rollout(sim)
+
+    def run(values: dict[str, Tensor]) -> tuple[Tensor, NDArray[np.uint64]]:
+        start = state.to(torch.float64).replace(**{name: values[name] for name in STATE_FIELDS})
+        given = {name: values[name] for name in CONTROL_FIELDS if name in values}
+        parameters = {f"sim.{name}": values[name] for name in _PARAMETERS}
+        final, signature = torch.func.functional_call(
+            module, parameters, (start, Control(**given) if given else None, steps)
+        )
+        return loss(final), signature
+
+    leaves = {name: t.detach().clone().requires_grad_(name in names) for name, t in inputs.items()}
+    with torch.enable_grad():
+        value, base_signature = run(leaves)
+        grads = torch.autograd.grad(value, [leaves[name] for name in names], allow_unused=True, materialize_grads=True)
+
+    rows: list[tuple[str, float, float, bool]] = []
+    with torch.no_grad():
+        for name, grad in zip(names, grads):
+            for _ in range(directions):
+                step = eps * _direction(name, inputs, sim.dt, generator)
+                sides = [run({**inputs, name: inputs[name] + sign * step}) for sign in (1.0, -1.0)]
+                changed = any(bool((signature != base_signature).any()) for _, signature in sides)
+                difference = float(sides[0][0] - sides[1][0]) / (2 * eps)
+                rows.append((name, float((grad * step).sum()) / eps, difference, changed))
+    typical = math.sqrt(sum(derivative**2 for _, derivative, _, _ in rows) / len(rows)) if rows else 0.0
+    checks = []
+    for name, derivative, difference, changed in rows:
+        scale = max(abs(derivative), abs(difference), _SMALL * typical)
+        error = abs(derivative - difference) / scale if scale > 0.0 else 0.0
+        checks.append(DirectionCheck(name, derivative, difference, error, changed))
+    zero = tuple(name for name, grad in zip(names, grads) if not grad.any())
+    return GradcheckReport(tuple(checks), zero, steps, eps, median_tolerance, max_tolerance)
+
+
+def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps: int) -> dict[str, Tensor]:
+    """All that can be moved, in float64 and without history; controls with a time axis if they are a sequence."""
+    start = state.detach().to(torch.float64)
+    inputs = {name: getattr(start, name) for name in STATE_FIELDS}
+    if isinstance(controls, Control):
+        given = {name: getattr(controls, name) for name in CONTROL_FIELDS}
+    else:
+        batch = start.leading_shape[0] if start.leading_shape else None
+        count = len(sim.body_names)
+        given = dict(zip(CONTROL_FIELDS, over_time(where, controls, steps, state.dtype, count, 0, batch)[0]))
+    inputs.update({name: t.detach().to(torch.float64) for name, t in given.items() if t is not None})
+    inputs.update({name: getattr(sim, name).detach().to(torch.float64) for name in _PARAMETERS})
+    return inputs
+
+
+def _normal(shape: torch.Size, generator: torch.Generator) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def _mean_inertia(inertia: Tensor) -> Tensor:
+    return inertia.diagonal(dim1=-2, dim2=-1).mean(-1)
+
+
+def _direction(name: str, inputs: dict[str, Tensor], dt: float, generator: torch.Generator) -> Tensor:
+    """A random direction of the size that eps is multiplied with."""
+    value = inputs[name]
+    direction = _normal(value.shape, generator)
+    if name == "orientation":
+        unit = torch.nn.functional.normalize(value, dim=-1)
+        return direction - (direction * unit).sum(-1, keepdim=True) * unit
+    if name == "mass":
+        return _PARAMETER_STEP * value * direction
+    if name == "inertia":
+        return _PARAMETER_STEP * _mean_inertia(value)[..., None, None] * 0.5 * (direction + direction.mT)
+    if name == "gravity":
+        return direction / dt
+    if name == "force":
+        return direction * inputs["mass"].unsqueeze(-1) / dt
+    if name == "torque":
+        return direction * _mean_inertia(inputs["inertia"]).unsqueeze(-1) / dt
+    return direction

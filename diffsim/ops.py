@@ -1,0 +1,346 @@
+"""The operators under the layer: each one autograd.Function (with its rule for vmap) and one documented wrapper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import _core
+
+__all__ = ["ConvergenceWarning", "Info", "RolloutCall", "SolverError", "rollout"]
+
+# Whether torch.func transforms (vmap, grad, ...) are running. They dispatch through Function.apply; without them two
+# shortcuts are open that halve the cost of a call.
+_transforms_active = torch._C._are_functorch_transforms_active
+
+# Input axes without time and batch, in the order of the operator: state, controls, mass, inertia, gravity.
+_BASE_NDIM = (2, 2, 2, 2, 2, 2, 2, 2, 1, 3, 1)
+_CONTROLS = range(4, 8)
+
+OptionalTensors = tuple[Tensor | None, ...]
+
+
+class ConvergenceWarning(UserWarning):
+    """A step did not converge; the last penetration-free state was returned. Warned once per simulator."""
+
+
+@dataclass(frozen=True)
+class Info:
+    """Statistics of the last call of a simulator: of its last step, where nothing else is said.
+
+    Over a batch, counts are sums and the rest is the largest.
+    """
+
+    converged: bool  #: every step of every scene of the call
+    failed_steps: int  #: steps of the call that did not converge, all scenes
+    contacts: int  #: contacts in the zones' optimizations
+    zones: int  #: independent groups of bodies in contact
+    largest_zone: int  #: bodies in the largest of them
+    iterations: int  #: Newton iterations of the zone that took most
+    residual: float  #: KKT residual where iteration stopped, relative
+    max_compression: float  #: how far the most compressed contact is below its rest distance [m]
+    milliseconds: dict[str, float]  #: time per stage [ms]
+
+
+class SolverError(RuntimeError):
+    """A step did not converge, and the simulator was asked for ``on_failure="raise"``.
+
+    Attributes:
+        info: Statistics of the call; `iterations` and `residual` are those of its last step.
+        state: What the call would have returned: every configuration in it is free of penetration.
+    """
+
+    def __init__(self, text: str, info: Info, state: Any = None) -> None:
+        super().__init__(text)
+        self.info = info
+        self.iterations = info.iterations
+        self.residual = info.residual
+        self.state = state
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.args[0], self.info, self.state)
+
+
+class RolloutCall:
+    """What one call of `rollout` needs beside tensors, and what it leaves behind. Use an instance once."""
+
+    __slots__ = (
+        "controls_have_time",
+        "info",
+        "keep_tape",
+        "keep_time",
+        "model",
+        "num_threads",
+        "options",
+        "record",
+        "signature",
+        "steps",
+        "tape",
+        "want_signature",
+    )
+
+    def __init__(
+        self,
+        model: _core.Model,
+        options: _core.Options,
+        steps: int,
+        num_threads: int,
+        controls_have_time: bool = False,
+        keep_time: bool = False,
+        keep_tape: bool = True,
+        want_signature: bool = False,
+    ) -> None:
+        self.model = model
+        self.options = options
+        self.steps = steps
+        self.num_threads = num_threads
+        self.controls_have_time = controls_have_time
+        self.keep_time = keep_time
+        self.keep_tape = keep_tape  # False: the backward runs the forward again instead (checkpointing)
+        self.want_signature = want_signature
+        self.record = False
+        self.tape: _core.Tape | None = None
+        self.info: _core.Info | None = None
+        self.signature: np.ndarray | None = None  # uint64 hash of the active contacts, shape (steps[, B])
+
+
+def _array(tensor: Tensor | None) -> np.ndarray | None:
+    if tensor is None:
+        return None
+    if not tensor.is_contiguous():
+        tensor = tensor.contiguous()
+    return tensor.numpy(force=True)  # force: also where it requires grad; no copy on the cpu
+
+
+def _run(call: RolloutCall, arrays: list[np.ndarray | None], record: bool) -> _core.Rollout:
+    return _core.rollout(
+        call.model,
+        call.options,
+        *arrays,
+        steps=call.steps,
+        controls_have_time=call.controls_have_time,
+        keep_time=call.keep_time,
+        record=record,
+        num_threads=call.num_threads,
+    )
+
+
+class _Rollout(torch.autograd.Function):
+    # Not `once_differentiable`: that lets some second derivatives through as silent zeros. Here the backward is an
+    # operator of its own (for vmap over the backward, as in jacrev), and its backward says no.
+    @staticmethod
+    def forward(call: RolloutCall, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        result = _run(call, [_array(t) for t in inputs], call.record)
+        call.tape = result.tape
+        call.info = result.info
+        if call.want_signature:
+            call.signature = result.signature
+        return (
+            torch.from_numpy(result.position),
+            torch.from_numpy(result.orientation),
+            torch.from_numpy(result.velocity),
+            torch.from_numpy(result.angular_velocity),
+        )
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.call = inputs[0]  # its tape is read-only, so that backward may run twice
+        ctx.save_for_backward(*inputs[1:])
+        ctx.set_materialize_grads(False)  # no upstream gradient, no work: the core gets None
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        call = _BackwardCall(ctx.call, ctx.needs_input_grad[1:])
+        if torch.is_grad_enabled() or _transforms_active():
+            return None, *_RolloutBackward.apply(call, *ctx.saved_tensors, *grads)
+        return None, *_RolloutBackward.forward(call, *ctx.saved_tensors, *grads)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], call: RolloutCall, *inputs: Tensor | None) -> Any:
+        folded, batch = _fold_inputs(call, info.batch_size, in_dims[1:], inputs)
+        # A tensor hides from the outside of vmap whether it requires grad; here, one level further down, it shows.
+        call.record = call.record or (call.keep_tape and _any_requires_grad(folded))
+        time = int(call.keep_time)
+        outputs = _Rollout.apply(call, *folded)
+        return tuple(_unfold(t, info.batch_size, batch, time) for t in outputs), (time,) * 4
+
+
+class _BackwardCall:
+    __slots__ = ("call", "needs")
+
+    def __init__(self, call: RolloutCall, needs: tuple[bool, ...]) -> None:
+        self.call = call
+        self.needs = needs
+
+
+class _RolloutBackward(torch.autograd.Function):
+    """(inputs, gradients of the outputs) -> gradients of the inputs."""
+
+    @staticmethod
+    def forward(backward_call: _BackwardCall, *tensors: Tensor | None) -> OptionalTensors:
+        call = backward_call.call
+        arrays = [_array(t) for t in tensors]
+        tape = call.tape
+        if tape is None:  # checkpointing: the same bits again, recorded this time, and dropped after use
+            tape = _run(call, arrays[:11], record=True).tape
+        grads = _core.rollout_backward(tape, *arrays, needs=backward_call.needs, num_threads=call.num_threads)
+        return tuple(None if g is None else torch.from_numpy(g) for g in grads)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> OptionalTensors:
+        raise NotImplementedError(
+            "diffsim: gradients are first order only; a second derivative through a step was asked for"
+            " (create_graph=True, hessian, or a gradient of a gradient)"
+        )
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], backward_call: _BackwardCall, *tensors: Tensor | None) -> Any:
+        size, dims = info.batch_size, in_dims[1:]
+        if all(dim is None for dim in dims[:11]):
+            # One forward, many upstream gradients (jacrev, is_grads_batched): one tape, used once per gradient.
+            rows = [
+                _RolloutBackward.apply(
+                    backward_call, *(t if t is None or d is None else t.select(d, i) for t, d in zip(tensors, dims))
+                )
+                for i in range(size)
+            ]
+            outputs = tuple(None if column[0] is None else torch.stack(column) for column in zip(*rows))
+            return outputs, tuple(None if t is None else 0 for t in outputs)
+        call = backward_call.call
+        folded, batch = _fold_inputs(call, size, dims[:11], tensors[:11])
+        folded_grads = [_fold(t, d, size, batch, 2, int(call.keep_time)) for t, d in zip(tensors[11:], dims[11:])]
+        grads = _RolloutBackward.apply(backward_call, *folded, *folded_grads)
+        outputs = tuple(
+            None if grad is None or t is None else _unfold_like(t, dim, grad, size, batch, base, time)
+            for t, dim, grad, base, time in zip(tensors, dims, grads, _BASE_NDIM, _times(call))
+        )
+        return outputs, tuple(None if t is None else 0 for t in outputs)
+
+
+def _any_requires_grad(tensors: Any) -> bool:
+    return any(t is not None and t.requires_grad for t in tensors)
+
+
+def _times(call: RolloutCall) -> list[int]:
+    """How many time axes each input has."""
+    return [int(i in _CONTROLS and call.controls_have_time) for i in range(11)]
+
+
+def _fold_inputs(
+    call: RolloutCall, size: int, dims: tuple[int | None, ...], inputs: tuple[Tensor | None, ...]
+) -> tuple[list[Tensor | None], int | None]:
+    """The axis of vmap, in front of the core's batch axis, becomes one with it. Also returns the batch size there was.
+
+    Inputs that are not mapped are repeated, so that the backward can give each mapped element its own gradient.
+    """
+    times = _times(call)
+    batch = None
+    for t, dim, base, time in zip(inputs, dims, _BASE_NDIM, times):
+        if t is not None and t.ndim - (dim is not None) > base + time:
+            native = list(t.shape)
+            if dim is not None:
+                del native[dim]
+            batch = native[time]
+    folded = [_fold(t, d, size, batch, base, time) for t, d, base, time in zip(inputs, dims, _BASE_NDIM, times)]
+    return folded, batch
+
+
+def _fold(t: Tensor | None, dim: int | None, size: int, batch: int | None, base: int, time: int) -> Tensor | None:
+    """([time,] [batch,] *base) with vmap's axis at `dim` -> ([time,] size or size * batch, *base)."""
+    if t is None:
+        return None
+    t = t.unsqueeze(time) if dim is None else t.movedim(dim, time)
+    if batch is None:
+        return t.expand(*t.shape[:time], size, *t.shape[time + 1 :])
+    if t.ndim == time + 1 + base:
+        t = t.unsqueeze(time + 1)
+    return t.expand(*t.shape[:time], size, batch, *t.shape[time + 2 :]).flatten(time, time + 1)
+
+
+def _unfold(t: Tensor, size: int, batch: int | None, time: int) -> Tensor:
+    """([time,] size * batch, ...) -> ([time,] size, batch, ...)"""
+    return t if batch is None else t.unflatten(time, (size, batch))
+
+
+def _unfold_like(
+    t: Tensor, dim: int | None, grad: Tensor, size: int, batch: int | None, base: int, time: int
+) -> Tensor:
+    """The gradient of folded `t` -> (size, *shape of one mapped element of t)."""
+    grad = _unfold(grad, size, batch, time).movedim(time, 0)
+    shared = t.ndim - (dim is not None) == base + time  # by all scenes of the batch
+    return grad if batch is None or not shared else grad.sum(1 + time)
+
+
+_plain_apply = super(torch.autograd.Function, _Rollout).apply  # without inspect.signature, three quarters of the cost
+
+
+def rollout(
+    call: RolloutCall,
+    position: Tensor,
+    orientation: Tensor,
+    velocity: Tensor,
+    angular_velocity: Tensor,
+    force: Tensor | None,
+    torque: Tensor | None,
+    body_velocity: Tensor | None,
+    body_angular_velocity: Tensor | None,
+    mass: Tensor,
+    inertia: Tensor,
+    gravity: Tensor,
+) -> tuple[Tensor, ...]:
+    """Advance all bodies by ``call.steps`` steps, each Eqs. 2 and 6 of Qiao et al. (ICML 2020) as one optimization.
+
+    All tensors are float64 on the cpu. Any may have a batch axis of size B in front of its shape below; if one has,
+    the outputs have. With ``call.controls_have_time`` every control has a time axis of length steps in front of that.
+
+    Args:
+        call: Model, options, number of steps and threads; receives `info` and the tape.
+        position: Centres of mass, world [m], shape (n, 3).
+        orientation: Unit quaternions w, x, y, z, body to world, shape (n, 4).
+        velocity: Of the centres of mass, world [m/s], shape (n, 3).
+        angular_velocity: World [rad/s], shape (n, 3).
+        force: At the centre of mass, world [N], shape (n, 3), or None for zero.
+        torque: About the centre of mass, world [N·m], shape (n, 3), or None for zero.
+        body_velocity: Of kinematic bodies, world [m/s], shape (n, 3), or None: as in the state.
+        body_angular_velocity: Of kinematic bodies, world [rad/s], shape (n, 3), or None: as in the state.
+        mass: [kg], shape (n,).
+        inertia: Body frame [kg·m²], shape (n, 3, 3).
+        gravity: [m/s²], shape (3,).
+    Returns: position, orientation, velocity, angular_velocity after the last step, or, with ``call.keep_time``, after
+        every step with a leading time axis.
+    Raises: ValueError for what only the core can judge: not finite, not positive, in penetration.
+    Gradients: with respect to all inputs, first order only; the set of active contacts is held fixed.
+    """
+    inputs = (
+        position,
+        orientation,
+        velocity,
+        angular_velocity,
+        force,
+        torque,
+        body_velocity,
+        body_angular_velocity,
+        mass,
+        inertia,
+        gravity,
+    )
+    if not torch.is_grad_enabled():
+        call.keep_tape = False
+    outputs: tuple[Tensor, ...]
+    if _transforms_active():
+        call.record = call.keep_tape and _any_requires_grad(inputs)
+        outputs = _Rollout.apply(call, *inputs)
+    elif torch.is_grad_enabled() and _any_requires_grad(inputs):
+        call.record = call.keep_tape
+        outputs = _plain_apply(call, *inputs)
+    else:
+        outputs = _Rollout.forward(call, *inputs)
+    return outputs

@@ -1,0 +1,472 @@
+"""The simulator: a scene as a torch.nn.Module that advances its state by time steps."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from . import _core
+from ._check import check_choice, check_count, check_instance, check_number
+from ._inputs import Controls, Inputs, checked_inputs
+from ._measurements import Measurements
+from .ops import ConvergenceWarning, Info, RolloutCall, SolverError, rollout
+from .scene import Scene
+from .state import Control, State
+
+__all__ = ["Simulator"]
+
+_PROGRESS_UPDATES = 100  # of a rollout that is not cut into segments for checkpointing
+
+
+class Simulator(Measurements):
+    """Advances a scene by time steps of `dt`; differentiable, deterministic, without memory from one call to the next.
+
+    Each step minimizes the distance to the free motion, in the metric of the masses, subject to surfaces keeping their
+    distance (Eqs. 2 and 6 of Qiao et al., ICML 2020, as one problem).
+
+    Physical parameters are parameters of the module, float64, with ``requires_grad=False`` until asked for, and can be
+    exchanged for a call by `torch.func.functional_call`: `mass` (n_bodies,) [kg], `inertia` (n_bodies, 3, 3) in body
+    axes [kg·m²], `gravity` (3,) [m/s²], `friction` and `restitution` (n_objects,), and per cloth `cloth_density`,
+    `cloth_stretch`, `cloth_shear`, `cloth_bend`, `cloth_damping` (n_cloths,). Mass and inertia of static and kinematic
+    bodies are zero and are not read.
+
+    Args:
+        scene: Read now; later changes to it have no effect.
+        dt: Time step [s].
+        thickness: Distance kept between surfaces of default margin [m]. Default: 1e-3 of the scene's smallest extent.
+        compliance: How far contacts give way, relative to hard contact; 0 is hard contact.
+        adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
+        coupling: "monolithic".
+        tolerance: Relative KKT residual at which a step has converged.
+        max_iterations: Newton iterations a step may take.
+        num_threads: Solve that much at a time; no result depends on it. Default: `torch.get_num_threads()`.
+        on_failure: What follows a step that did not converge: "warn" (once, `ConvergenceWarning`) or "raise"
+            (`SolverError`).
+        check: Whether to look for overlaps in the scene, and for parameter values this version does not know. Types and
+            shapes are always checked.
+    Raises: TypeError, ValueError for what the message names, overlapping bodies among it; NotImplementedError for
+        ``coupling="split"``.
+    """
+
+    friction: nn.Parameter
+    restitution: nn.Parameter
+    cloth_density: nn.Parameter
+    cloth_stretch: nn.Parameter
+    cloth_shear: nn.Parameter
+    cloth_bend: nn.Parameter
+    cloth_damping: nn.Parameter
+
+    def __init__(
+        self,
+        scene: Scene,
+        dt: float,
+        *,
+        thickness: float | None = None,
+        compliance: float = 1e-4,
+        adjoint: str = "exact",
+        coupling: str = "monolithic",
+        tolerance: float = 1e-10,
+        max_iterations: int = 200,
+        num_threads: int | None = None,
+        on_failure: str = "warn",
+        check: bool = True,
+    ) -> None:
+        super().__init__()
+        where = "Simulator"
+        check_instance(where, "scene", scene, Scene, "be a diffsim.Scene")
+        check_choice(where, "adjoint", adjoint, ("exact", "qr", "dense"))
+        check_choice(where, "coupling", coupling, ("monolithic", "split"))
+        check_choice(where, "on_failure", on_failure, ("warn", "raise"))
+        if coupling == "split":
+            raise NotImplementedError('Simulator: coupling="split" is not implemented yet; use "monolithic"')
+        self._dt = check_number(where, "dt", dt, above=0.0)
+        self._settings = {
+            "dt": self._dt,
+            "compliance": check_number(where, "compliance", compliance, least=0.0),
+            "adjoint": adjoint,
+            "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
+            "max_iterations": check_count(where, "max_iterations", max_iterations),
+        }
+        self._num_threads = None if num_threads is None else check_count(where, "num_threads", num_threads)
+        self._on_failure = on_failure
+        self._check = bool(check)
+        self._packed = scene.pack(None if thickness is None else check_number(where, "thickness", thickness, above=0.0))
+        if self._check:
+            scene.validate(self._packed)
+        for name in ("mass", "inertia", "gravity", "friction", "restitution"):
+            value = torch.from_numpy(np.array(getattr(self._packed, name), dtype=np.float64))
+            self.register_parameter(name, nn.Parameter(value, requires_grad=False))
+        for name in ("density", "stretch", "shear", "bend", "damping"):
+            value = torch.zeros(0, dtype=torch.float64)
+            self.register_parameter(f"cloth_{name}", nn.Parameter(value, requires_grad=False))
+        self._info: Info | list[Any] | None = None  # a list of the core's, one per segment, until someone asks
+        self._warned = False
+        self._build()
+
+    def _build(self) -> None:
+        """What is made from the packed scene and cannot be pickled."""
+        p = self._packed
+        self._model = _core.Model(
+            names=list(p.names),
+            kind=p.kind,
+            margin=p.margin,
+            vertex_count=p.vertex_count,
+            vertices=p.vertices,
+            face_count=p.face_count,
+            faces=p.faces,
+            has_ground=p.has_ground,
+            ground_height=p.ground_height,
+            ground_margin=p.ground_margin,
+            thickness=p.thickness,
+        )
+        self._options = _core.Options(**self._settings)
+        n = self._body_count = len(p.names)
+        self._node_count = 0
+        self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
+        self._parameter_shapes = torch.Size((n,)), torch.Size((n, 3, 3)), torch.Size((3,))
+        self._separated: tuple[np.ndarray, np.ndarray] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {**self.__dict__, "_info": self.info}
+        for name in ("_model", "_options"):
+            del state[name]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._build()
+
+    @property
+    def dt(self) -> float:
+        """Time step [s]."""
+        return self._dt
+
+    @property
+    def thickness(self) -> float:
+        """Distance kept between surfaces of default margin [m]."""
+        return float(self._packed.thickness)
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of the bodies, in the order of the body axis."""
+        return tuple(self._packed.names)
+
+    @property
+    def info(self) -> Info | None:
+        """Statistics of the last step; None before the first."""
+        if isinstance(self._info, list):
+            self._info = _combined(self._info)
+        return self._info
+
+    # ---- states ------------------------------------------------------------------------------------------------------
+
+    def initial_state(self, batch: int | None = None) -> State:
+        """The state the scene describes, with bodies nearer than `thickness` moved apart by at most that.
+
+        Args:
+            batch: Number of copies, along a new leading axis. Default: one state without it.
+        Returns: New tensors of the parameters' dtype (float64, or float32 after ``sim.float()``).
+        """
+        p = self._packed
+        if self._separated is None:
+            position, orientation, _ = _core.separate(self._model, self._options, p.position, p.orientation, p.mass, p.inertia)
+            self._separated = position, orientation
+        arrays = (*self._separated, p.velocity, p.angular_velocity)
+        tensors = [torch.from_numpy(a).to(self.mass.dtype) for a in arrays]
+        if batch is not None:
+            count = check_count("initial_state", "batch", batch)
+            tensors = [t.expand(count, *t.shape) for t in tensors]
+        return State(*(t.clone(memory_format=torch.contiguous_format) for t in tensors))
+
+    # ---- stepping ----------------------------------------------------------------------------------------------------
+
+    def forward(self, state: State, control: Control | None = None) -> State:
+        """One time step; differentiable with respect to the state, the control, `mass`, `inertia` and `gravity`.
+
+        Args:
+            state: Of one dtype, float32 or float64, with or without a batch axis (of size B) in front of any tensor.
+            control: Of the state's dtype, each tensor with or without a batch axis. Default: no forces, and kinematic
+                bodies go on as they move.
+        Returns: The state one `dt` later, in the state's dtype; with a batch axis if any input has one.
+        Raises:
+            TypeError, ValueError: Wrong type, dtype, device or shape; values that are not finite; quaternions further
+                than 1e-3 from length 1; bodies in each other. The message names object, field and value.
+            SolverError: A step did not converge, if ``on_failure="raise"``.
+        Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
+        """
+        inputs = self._float64_inputs(state, control)
+        if inputs is None:  # anything but float64 tensors in the plainest shapes
+            inputs, _ = self._checked_inputs("Simulator", state, control, None)
+        if self._check:
+            self._check_unused_parameters()
+        threads = self._num_threads or torch.get_num_threads()
+        call = RolloutCall(self._model, self._options, 1, threads)
+        outputs = rollout(call, *inputs)  # type: ignore[arg-type]
+        result = _result(outputs, state)
+        self._finish([call.info], result)
+        return result
+
+    def rollout(
+        self,
+        state: State,
+        controls: Controls,
+        steps: int,
+        checkpoint_every: int | None = None,
+        progress: bool = False,
+    ) -> State:
+        """Many time steps: the loop over them, forward and backward, runs in C++.
+
+        Args:
+            state: As for one step.
+            controls: None; one Control, held constant; a sequence with one Control per step; or a Control with a
+                leading time axis. A tensor of shape (n, 3) is constant; one of shape (steps, B, n, 3) has a time axis,
+                and either of its leading axes may have size 1. With an unbatched state, (steps, n, 3) has a time axis.
+                With a state of batch size B, (B, n, 3) is constant and (steps, n, 3) the same for all scenes; if B
+                equals steps these cannot be told apart, and the error says how to write either.
+            steps: Number of steps.
+            checkpoint_every: Keep the record gradients need only for this many steps at a time, k, and compute it again
+                in the backward: memory O(steps / k + k), about one more forward in time, the same values bit by bit.
+            progress: Show a progress bar on stderr.
+        Returns: State with a leading time axis: after the first step, ..., after the last.
+        Raises: As for one step.
+        Gradients: As for one step. A float32 rollout is float64 throughout and rounded once, at the end.
+        """
+        return self._rollout(state, controls, steps, checkpoint_every, progress)[0]
+
+    def _rollout(
+        self,
+        state: State,
+        controls: Controls,
+        steps: int,
+        checkpoint_every: int | None = None,
+        progress: bool = False,
+        want_signature: bool = False,
+    ) -> tuple[State, np.ndarray | None]:
+        where = "rollout"
+        steps = check_count(where, "steps", steps)
+        every = steps if checkpoint_every is None else check_count(where, "checkpoint_every", checkpoint_every)
+        length = every
+        if progress and checkpoint_every is None:
+            length = max(1, steps // _PROGRESS_UPDATES)
+        inputs, has_time = self._checked_inputs(where, state, controls, steps)
+        if self._check:
+            self._check_unused_parameters()
+        threads = self._num_threads or torch.get_num_threads()
+        now, driven, parameters = inputs[:4], inputs[4:8], inputs[8:]
+        segments, infos, signatures = [], [], []
+        with _progress_bar(steps, progress) as advance:
+            for start in range(0, steps, length):
+                count = min(length, steps - start)
+                call = RolloutCall(
+                    self._model,
+                    self._options,
+                    count,
+                    threads,
+                    controls_have_time=has_time,
+                    keep_time=True,
+                    keep_tape=checkpoint_every is None or steps <= every,
+                    want_signature=want_signature,
+                )
+                part = driven
+                if has_time and count < steps:
+                    part = tuple(None if t is None else t[start : start + count] for t in driven)
+                segment = rollout(call, *now, *part, *parameters)  # type: ignore[arg-type]
+                if start + count < steps:
+                    now = tuple(t[-1].clone() for t in segment)  # a view would keep the segment alive to the backward
+                segments.append(segment)
+                infos.append(call.info)
+                signatures.append(call.signature)
+                advance(count)
+        outputs = segments[0] if len(segments) == 1 else tuple(torch.cat(column) for column in zip(*segments))
+        result = _result(outputs, state)
+        self._finish(infos, result)
+        return result, np.concatenate(signatures) if want_signature else None  # type: ignore[arg-type]
+
+    def _float64_inputs(self, state: Any, control: Any) -> Inputs | None:
+        """The operator's tensors if nothing has to be converted or complained about; None otherwise. Kept fast."""
+        if type(state) is not State:
+            return None
+        f64 = torch.float64
+        vector, quaternion, nodes = self._state_shapes
+        position, orientation = state.position, state.orientation
+        velocity, angular_velocity = state.velocity, state.angular_velocity
+        mass, inertia, gravity = self.mass, self.inertia, self.gravity
+        try:
+            if position.shape != vector:
+                if position.ndim != 3:
+                    return None
+                batch = position.shape[0]
+                vector, quaternion, nodes = (torch.Size((batch, *shape)) for shape in self._state_shapes)
+            mass_shape, inertia_shape, gravity_shape = self._parameter_shapes
+            if not (
+                position.dtype is f64
+                and orientation.dtype is f64
+                and velocity.dtype is f64
+                and angular_velocity.dtype is f64
+                and mass.dtype is f64
+                and inertia.dtype is f64
+                and gravity.dtype is f64
+                and position.shape == vector
+                and orientation.shape == quaternion
+                and velocity.shape == vector
+                and angular_velocity.shape == vector
+                and mass.shape == mass_shape
+                and inertia.shape == inertia_shape
+                and gravity.shape == gravity_shape
+                and position.is_cpu
+                and orientation.is_cpu
+                and velocity.is_cpu
+                and angular_velocity.is_cpu
+                and mass.is_cpu
+                and inertia.is_cpu
+                and gravity.is_cpu
+                and state.node_position.shape == nodes
+                and state.node_velocity.shape == nodes
+            ):
+                return None
+            driven: tuple[Any, ...] = (None, None, None, None)
+            if control is not None:
+                if type(control) is not Control or control.node_force is not None or control.node_velocity is not None:
+                    return None
+                driven = (control.force, control.torque, control.body_velocity, control.body_angular_velocity)
+                for t in driven:
+                    if t is not None and not (t.dtype is f64 and t.shape == vector and t.is_cpu):
+                        return None
+        except AttributeError:  # not a tensor
+            return None
+        return position, orientation, velocity, angular_velocity, *driven, mass, inertia, gravity
+
+    def _checked_inputs(self, where: str, state: Any, controls: Any, steps: int | None) -> tuple[Inputs, bool]:
+        parameters = self.mass, self.inertia, self.gravity
+        return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
+
+    def _check_unused_parameters(self) -> None:
+        if torch._C._are_functorch_transforms_active():
+            return  # values cannot be looked at there
+        for name in ("friction", "restitution"):
+            values = getattr(self, name).numpy(force=True)
+            if values.tobytes().strip(b"\0") and values.any():  # .any() alone takes half as long as a small step
+                raise NotImplementedError(f"Simulator: {name} must be 0, contact has none in this version yet")
+
+    def _finish(self, segments: list[Any], result: State) -> None:
+        """Keeps the statistics of the call, and warns or raises if a step did not converge."""
+        self.__dict__["_info"] = segments  # nn.Module's __setattr__ and Info itself take too long
+        if all(segment.converged for segment in segments):
+            return
+        info = self.info
+        assert info is not None  # a call was made
+        text = (
+            f"Simulator: {info.failed_steps} step(s) did not converge; the last step of the call took {info.iterations}"
+            f" iterations to a relative residual of {info.residual:.3g} (tolerance {self._settings['tolerance']:g})."
+            " The last penetration-free state is returned; try a smaller dt or more max_iterations; see also sim.info"
+        )
+        if self._on_failure == "raise":
+            raise SolverError(text, info, result)
+        if not self._warned:
+            self._warned = True
+            warnings.warn(text, ConvergenceWarning, stacklevel=_frames_to_user())
+
+    # ---- description -------------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        runs, left_out = self._stages()
+        bodies = f"{self._body_count} " + ("body" if self._body_count == 1 else "bodies")
+        settings = ", ".join(f"{name}={value!r}" for name, value in self._settings.items())
+        return (
+            f"{type(self).__name__}({bodies}, thickness={self.thickness:g}, {settings})\n"
+            f"  runs: {', '.join(runs) or 'nothing'}\n"
+            f"  leaves out: {', '.join(left_out) or 'nothing'}"
+        )
+
+    def _stages(self) -> tuple[list[str], list[str]]:
+        count = np.bincount(self._packed.kind, minlength=3)
+        n, dynamic, kinematic = self._body_count, int(count[0]), int(count[2])
+        runs: list[str] = []
+        left_out: list[str] = []
+
+        def stage(name: str, reason_against: str | None) -> None:
+            runs.append(name) if reason_against is None else left_out.append(f"{name} ({reason_against})")
+
+        none_moves = None if dynamic else "no dynamic body"
+        stage("free motion", none_moves)
+        stage("kinematic motion", None if kinematic else "no kinematic body")
+        stage("ground contact", none_moves if self._packed.has_ground else "no ground")
+        stage("body-body contact", none_moves or (None if n > 1 else "one body"))
+        stage("friction", "not in this version")
+        stage("restitution", "not in this version")
+        stage("cloth", "no cloth")
+        return runs, left_out
+
+
+def _result(outputs: tuple[Tensor, ...], state: State) -> State:
+    """The operator's outputs as a state of the given state's dtype, with its (empty) cloth."""
+    position, orientation, velocity, angular_velocity = outputs
+    if state.position.dtype is not torch.float64:
+        dtype = state.position.dtype
+        position, orientation, velocity, angular_velocity = (t.to(dtype) for t in outputs)
+    node_position, node_velocity = state.node_position, state.node_velocity
+    if node_position.ndim != position.ndim or node_position.shape[:-2] != position.shape[:-2]:
+        leading = position.shape[:-2]
+        node_position = node_position.expand(*leading, *node_position.shape[-2:])
+        node_velocity = node_velocity.expand(*leading, *node_velocity.shape[-2:])
+    return State._make(
+        position=position,
+        orientation=orientation,
+        velocity=velocity,
+        angular_velocity=angular_velocity,
+        node_position=node_position,
+        node_velocity=node_velocity,
+    )
+
+
+def _combined(segments: list[Any]) -> Info:
+    """The statistics of a call from those of its segments."""
+    last = segments[-1]
+    return Info(
+        converged=all(segment.converged for segment in segments),
+        failed_steps=sum(segment.failed_steps for segment in segments),
+        contacts=last.contacts,
+        zones=last.zones,
+        largest_zone=last.largest_zone,
+        iterations=last.iterations,
+        residual=last.residual,
+        max_compression=last.max_compression,
+        milliseconds=dict(last.milliseconds),
+    )
+
+
+def _frames_to_user() -> int:
+    """How far up the stack, seen from the caller, the first frame outside of diffsim and torch is."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("diffsim", "torch"):
+        level, frame = level + 1, frame.f_back
+    return level
+
+
+@contextmanager
+def _progress_bar(steps: int, shown: bool) -> Iterator[Callable[[int], object]]:
+    if not shown:
+        yield lambda count: None
+        return
+    try:
+        from tqdm.auto import tqdm
+    except ImportError:
+        done = 0
+
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            sys.stderr.write(f"\rrollout: step {done} of {steps}" + ("\n" if done == steps else ""))
+            sys.stderr.flush()
+
+        yield advance
+        return
+    with tqdm(total=steps, desc="rollout", unit="step") as bar:
+        yield bar.update

@@ -1,0 +1,18 @@
+"""What all Python tests share."""
+
+from importlib.metadata import version
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+
+def pytest_report_header() -> str:
+    """Name the copy of diffsim under test: the installed one, unless PYTHONPATH says otherwise."""
+    spec = find_spec("diffsim")
+    return f"diffsim: {spec.origin if spec else 'not found'}, torch {version('torch')}"
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)

@@ -1,0 +1,366 @@
+"""The rollout operator under autograd and torch.func; what the numbers mean physically is tested elsewhere."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import functional_call, grad, jacrev, vjp, vmap
+
+import diffsim as ds
+from diffsim import _core
+
+STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
+# Two ways to the same derivative sum in different orders.
+ROUNDING = 1e-12
+
+
+def two_bodies() -> ds.Simulator:
+    """A box and a kinematic box, tumbling, far from each other and from anything else."""
+    scene = ds.Scene()
+    scene.add_body(ds.shapes.box((1.0, 0.7, 0.4)), density=2.0, position=(0, 0, 5), angular_velocity=(1.0, -2.0, 0.5))
+    scene.add_body(ds.shapes.box(1.0), kind="kinematic", position=(9, 0, 5), velocity=(0, 1, 0))
+    return ds.Simulator(scene, dt=0.01)
+
+
+def box_on_ground() -> ds.Simulator:
+    """A tilted box that lands on the ground in its third step."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(
+        ds.shapes.box((1.0, 0.7, 0.4)),
+        density=2.0,
+        position=(0, 0, 0.5),
+        orientation=(1, 0.3, 0.1, 0),
+        velocity=(1, 0, -3),
+    )
+    return ds.Simulator(scene, dt=0.01)
+
+
+@pytest.fixture
+def sim() -> ds.Simulator:
+    return two_bodies()
+
+
+@pytest.fixture
+def state(sim: ds.Simulator) -> ds.State:
+    return sim.initial_state()
+
+
+@pytest.fixture
+def force() -> Tensor:
+    return torch.randn(2, 3, dtype=torch.float64)
+
+
+class Calls:
+    """Counts what reaches the core, and keeps the arguments of the last backward."""
+
+    forward = recorded = backward = 0
+    needs: tuple[bool, ...] = ()
+    upstream: tuple[Any, ...] = ()
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    count = Calls()
+    forward, backward = _core.rollout, _core.rollout_backward
+
+    def counted_forward(*args: Any, **options: Any) -> Any:
+        count.forward += 1
+        count.recorded += options["record"]
+        return forward(*args, **options)
+
+    def counted_backward(*args: Any, **options: Any) -> Any:
+        count.backward += 1
+        count.needs, count.upstream = options["needs"], args[-4:]
+        return backward(*args, **options)
+
+    monkeypatch.setattr(_core, "rollout", counted_forward)
+    monkeypatch.setattr(_core, "rollout_backward", counted_backward)
+    return count
+
+
+def final(sim: ds.Simulator, state: ds.State, force: Tensor | None = None, steps: int = 3) -> Tensor:
+    """A scalar of everything a rollout returns."""
+    control = None if force is None else ds.Control(force=force)
+    end = sim.rollout(state, control, steps)
+    return torch.stack([(t * torch.arange(1.0, t.numel() + 1).view(t.shape)).sum() for t in fields(end)]).sum()
+
+
+def fields(state: ds.State) -> tuple[Tensor, ...]:
+    return tuple(getattr(state, name) for name in STATE_FIELDS)
+
+
+def close(a: Tensor, b: Tensor) -> bool:
+    assert a.shape == b.shape
+    assert b.abs().max() > 0
+    return bool((a - b).abs().max() <= ROUNDING * (1 + b.abs().max()))
+
+
+@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+@pytest.mark.parametrize("keep_time", [False, True])
+def test_gradcheck(make: Callable[[], ds.Simulator], keep_time: bool) -> None:
+    sim = make()
+    n = len(sim.body_names)
+    start = [t.requires_grad_() for t in fields(sim.initial_state())]
+    controls = [torch.randn(n, 3, dtype=torch.float64, requires_grad=True) for _ in range(4)]
+    parameters = [p.detach().clone().requires_grad_() for p in (sim.mass, sim.inertia, sim.gravity)]
+
+    def run(*inputs: Tensor) -> tuple[Tensor, ...]:
+        state, control, values = inputs[:4], inputs[4:8], dict(zip(("mass", "inertia", "gravity"), inputs[8:]))
+        module = RolloutModule(sim, keep_time)
+        names = ("force", "torque", "body_velocity", "body_angular_velocity")
+        args = (ds.State(*state), ds.Control(**dict(zip(names, control))))
+        return fields(functional_call(module, {f"sim.{k}": v for k, v in values.items()}, args))
+
+    # Inertia is perturbed one entry at a time: only its symmetric part is read, so symmetric gradients are compared.
+    parameters[1] = parameters[1].detach()
+    assert torch.autograd.gradcheck(run, (*start, *controls, *parameters), eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+class RolloutModule(torch.nn.Module):
+    def __init__(self, sim: ds.Simulator, keep_time: bool) -> None:
+        super().__init__()
+        self.sim, self.keep_time = sim, keep_time
+
+    def forward(self, state: ds.State, control: ds.Control) -> ds.State:
+        return self.sim.rollout(state, control, 4) if self.keep_time else self.sim(state, control)
+
+
+def test_a_step_is_a_rollout_of_one_step(sim: ds.Simulator, state: ds.State, force: Tensor) -> None:
+    control = ds.Control(force=force)
+    stepped, rolled = sim(state, control), sim.rollout(state, control, 1)
+    for a, b in zip(fields(stepped), fields(rolled)):
+        assert torch.equal(a, b[0])
+
+
+def test_nothing_is_recorded_unless_a_gradient_can_be_asked_for(
+    sim: ds.Simulator, state: ds.State, calls: Calls
+) -> None:
+    sim(state)
+    moving = state.replace(velocity=state.velocity.clone().requires_grad_())
+    with torch.no_grad():
+        sim(moving)
+    vmap(sim)(sim.initial_state(batch=2))
+    assert (calls.forward, calls.recorded) == (3, 0)
+    sim(moving)
+    assert (calls.forward, calls.recorded) == (4, 1)
+    sim.mass.requires_grad_()
+    sim(state)
+    assert (calls.forward, calls.recorded) == (5, 2)
+
+
+def test_requires_grad_changes_no_bit(sim: ds.Simulator, state: ds.State) -> None:
+    plain = sim.rollout(state, None, 20)
+    sim.inertia.requires_grad_()
+    tracked = sim.rollout(state.replace(position=state.position.clone().requires_grad_()), None, 20)
+    for a, b in zip(fields(plain), fields(tracked)):
+        assert torch.equal(a, b)
+
+
+def test_only_what_is_asked_for_is_computed(sim: ds.Simulator, state: ds.State, force: Tensor, calls: Calls) -> None:
+    force.requires_grad_()
+    velocity = state.velocity.clone().requires_grad_()
+    end = sim(state.replace(velocity=velocity), ds.Control(force=force))
+    end.velocity.sum().backward()
+    names = (*STATE_FIELDS, "force", "torque", "body_velocity", "body_angular_velocity", "mass", "inertia", "gravity")
+    assert {name for name, needed in zip(names, calls.needs) if needed} == {"velocity", "force"}
+    assert [g is not None for g in calls.upstream] == [False, False, True, False]
+    assert velocity.grad is not None
+    assert velocity.grad.any()
+    assert force.grad is not None
+    assert force.grad.any()
+
+
+def test_backward_runs_twice_with_the_same_result(sim: ds.Simulator, state: ds.State, force: Tensor) -> None:
+    force.requires_grad_()
+    loss = final(sim, state, force)
+    (first,) = torch.autograd.grad(loss, force, retain_graph=True)
+    (second,) = torch.autograd.grad(loss, force)
+    assert first.any()
+    assert torch.equal(first, second)
+    with pytest.raises(RuntimeError, match="second time"):
+        torch.autograd.grad(loss, force)
+
+
+def test_inputs_changed_in_place_are_noticed(sim: ds.Simulator, state: ds.State) -> None:
+    sim.mass.requires_grad_()
+    loss = sim(state).position.sum()
+    with torch.no_grad():
+        sim.mass.mul_(2.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_second_derivatives_are_refused(sim: ds.Simulator, state: ds.State, force: Tensor) -> None:
+    force.requires_grad_()
+    (first,) = torch.autograd.grad(final(sim, state, force), force, create_graph=True)
+    with pytest.raises(NotImplementedError, match="first order only"):
+        torch.autograd.grad(first.sum(), force)
+    with pytest.raises(NotImplementedError, match="first order only"):
+        grad(lambda f: grad(lambda g: final(sim, state, g))(f).sum())(force.detach())
+
+
+def test_leaving_a_transform_leaves_usable_tensors(sim: ds.Simulator, state: ds.State, force: Tensor) -> None:
+    leaked: list[ds.State] = []
+
+    def loss(f: Tensor) -> Tensor:
+        leaked.append(sim(state, ds.Control(force=f)))
+        return leaked[0].velocity.sum()
+
+    grad(loss)(force)
+    expected = sim(sim(state, ds.Control(force=force)))
+    assert torch.equal(sim(leaked[0]).position, expected.position)
+
+
+# ---- batches and vmap ------------------------------------------------------------------------------------------------
+
+
+def different_states(sim: ds.Simulator, *leading: int) -> ds.State:
+    state = sim.initial_state()
+    spread = 0.1 * torch.randn(*leading, *state.velocity.shape, dtype=torch.float64)
+    full = [t.expand(*leading, *t.shape) for t in (*fields(state), state.node_position, state.node_velocity)]
+    return ds.State(*full).replace(velocity=state.velocity + spread)
+
+
+@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+def test_batch_equals_single_runs(make: Callable[[], ds.Simulator]) -> None:
+    sim = make()
+    states = different_states(sim, 3)
+    velocity = states.velocity.requires_grad_()
+    together = sim.rollout(states.replace(velocity=velocity), None, 6)
+    (gradient,) = torch.autograd.grad(together.position.square().sum(), velocity)
+    for i in range(3):
+        alone = velocity[i].detach().requires_grad_()
+        one = sim.rollout(states[i].replace(velocity=alone), None, 6)
+        for a, b in zip(fields(together), fields(one)):
+            assert torch.equal(a[:, i], b)
+        (expected,) = torch.autograd.grad(one.position.square().sum(), alone)
+        assert torch.equal(gradient[i], expected)
+        assert expected.any()
+
+
+@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+def test_vmap_equals_the_native_batch(make: Callable[[], ds.Simulator], calls: Calls) -> None:
+    sim = make()
+    states = different_states(sim, 3)
+    native = sim.rollout(states, None, 4)
+    before = calls.forward
+    mapped = vmap(lambda s: sim.rollout(s, None, 4), out_dims=1)(states)
+    assert calls.forward == before + 1
+    for a, b in zip(fields(native), fields(mapped)):
+        assert torch.equal(a, b)
+    assert mapped.node_position.shape == (4, 3, 0, 3)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_nested_vmap_over_a_native_batch(sim: ds.Simulator, steps: int) -> None:
+    states = different_states(sim, 2, 3, 4)
+    forces = torch.randn(3, 2, 3, dtype=torch.float64)
+
+    def run(state: ds.State, force: Tensor) -> ds.State:
+        assert state.position.shape == (4, 2, 3)
+        return sim.rollout(state, ds.Control(force=force), steps)[-1]
+
+    result = vmap(vmap(run), in_dims=(0, None))(states, forces)
+    for i in range(2):
+        for j in range(3):
+            expected = sim.rollout(states[i, j], ds.Control(force=forces[j]), steps)[-1]
+            for a, b in zip(fields(result), fields(expected)):
+                assert torch.equal(a[i, j], b)
+
+
+def test_vmap_over_any_axis_of_controls_with_time(sim: ds.Simulator, state: ds.State) -> None:
+    forces = torch.randn(5, 2, 3, 4, dtype=torch.float64)  # steps, bodies, xyz, mapped
+
+    def run(force: Tensor) -> Tensor:
+        return sim.rollout(state, ds.Control(force=force), 5).velocity
+
+    result = vmap(run, in_dims=3)(forces)
+    for i in range(4):
+        assert torch.equal(result[i], run(forces[..., i].contiguous()))
+
+
+def test_vmap_of_grad_gives_one_gradient_each(sim: ds.Simulator) -> None:
+    states, mass = different_states(sim, 3), sim.mass.detach()
+
+    def loss(mass: Tensor, state: ds.State) -> Tensor:
+        return functional_call(
+            sim, {"mass": mass}, (state, ds.Control(force=torch.ones_like(state.velocity)))
+        ).velocity.sum()
+
+    mapped = vmap(grad(loss), in_dims=(None, 0))(mass, states)
+    assert mapped.shape == (3, 2)
+    for i in range(3):
+        assert close(mapped[i], grad(loss)(mass, states[i]))
+
+
+def test_vmap_of_grad_over_a_native_batch_sums_over_it(sim: ds.Simulator) -> None:
+    states, force = different_states(sim, 3, 4), torch.randn(5, 2, 3, dtype=torch.float64)
+
+    def loss(force: Tensor, state: ds.State) -> Tensor:
+        return sim.rollout(state, ds.Control(force=force), 5).position.square().sum()
+
+    mapped = vmap(grad(loss), in_dims=(None, 0))(force, states)
+    for i in range(3):
+        assert close(mapped[i], grad(loss)(force, states[i]))
+
+
+def test_grad_of_vmap(sim: ds.Simulator) -> None:
+    states, force = different_states(sim, 3), torch.randn(2, 3, dtype=torch.float64)
+
+    def loss(force: Tensor) -> Tensor:
+        return vmap(lambda s: sim.rollout(s, ds.Control(force=force), 3).position)(states).square().sum()
+
+    def looped(force: Tensor) -> Tensor:
+        runs = [sim.rollout(states[i], ds.Control(force=force), 3).position.square().sum() for i in range(3)]
+        return torch.stack(runs).sum()
+
+    assert close(grad(loss)(force), grad(looped)(force))
+    leaf = force.clone().requires_grad_()
+    assert close(torch.autograd.grad(loss(leaf), leaf)[0], grad(looped)(force))
+
+
+def test_jacrev_rows_are_gradients(sim: ds.Simulator, state: ds.State, force: Tensor, calls: Calls) -> None:
+    def run(force: Tensor) -> Tensor:
+        return sim.rollout(state, ds.Control(force=force), 3).position[-1]
+
+    jacobian = jacrev(run)(force)
+    assert calls.forward == 1
+    assert jacobian.shape == (2, 3, 2, 3)
+    for body in range(2):
+        for axis in range(3):
+            row = grad(lambda f, b=body, a=axis: run(f)[b, a])(force)  # type: ignore[misc]
+            assert torch.equal(jacobian[body, axis], row)
+    assert jacobian.any()
+
+
+def test_jacrev_inside_vmap(sim: ds.Simulator) -> None:
+    states, force = different_states(sim, 3), torch.randn(2, 3, dtype=torch.float64)
+
+    def run(force: Tensor, state: ds.State) -> Tensor:
+        return sim(state, ds.Control(force=force)).position
+
+    mapped = vmap(jacrev(run), in_dims=(None, 0))(force, states)
+    for i in range(3):
+        assert close(mapped[i], jacrev(run)(force, states[i]))
+
+
+def test_vjp_outside_of_its_transform(sim: ds.Simulator, state: ds.State, force: Tensor) -> None:
+    output, pull = vjp(lambda f: sim(state, ds.Control(force=f)).velocity, force)
+    (first,), (second,) = pull(torch.ones_like(output)), pull(2 * torch.ones_like(output))
+    assert first.any()
+    assert torch.equal(2 * first, second)
+
+
+def test_hidden_inputs_are_recorded_under_vmap(sim: ds.Simulator, calls: Calls) -> None:
+    """Inside vmap no tensor says that it requires grad; the operator has to find out."""
+    states = different_states(sim, 3)
+    velocity = states.velocity.requires_grad_()
+    result = vmap(sim)(states.replace(velocity=velocity))
+    assert (calls.forward, calls.recorded) == (1, 1)
+    result.position.sum().backward()
+    assert (calls.forward, calls.backward) == (1, 1)
+    assert velocity.grad is not None
+    assert velocity.grad.any()

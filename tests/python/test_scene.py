@@ -1,0 +1,474 @@
+"""What a scene accepts, what it refuses and how it says so, and the arrays it packs."""
+
+import copy
+import math
+import pickle
+import re
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from diffsim import scenes, shapes
+from diffsim.rotation import from_rpy, rotate, to_matrix
+from diffsim.scene import BodyHandle, PackedScene, Scene
+
+CUBE = shapes.box(1.0)
+NAN, INF = float("nan"), float("inf")
+
+
+def one_body(**arguments: Any) -> PackedScene:
+    scene = Scene()
+    scene.add_body(arguments.pop("mesh", CUBE), **{"density": 1000.0, **arguments})
+    return scene.pack()
+
+
+def open_box() -> shapes.Mesh:
+    vertices, faces = CUBE
+    return vertices, faces[2:]
+
+
+# ---- Packing ----------------------------------------------------------------------------------------------------
+
+
+def test_an_empty_scene_packs() -> None:
+    packed = Scene().pack()
+    assert packed.names == []
+    assert packed.vertices.shape == packed.faces.shape == packed.position.shape == (0, 3)
+    assert packed.orientation.shape == (0, 4)
+    assert packed.inertia.shape == (0, 3, 3)
+    assert (packed.has_ground, packed.ground_height, packed.ground_margin) == (False, 0.0, 0.0)
+    assert packed.thickness == 1e-3
+    np.testing.assert_array_equal(packed.gravity, [0.0, 0.0, -9.81])
+    Scene().validate(packed)
+
+
+def test_packed_arrays_of_a_mixed_scene() -> None:
+    scene = Scene(gravity=(0.1, 0.2, -9.0))
+    scene.add_body(CUBE, density=10.0, position=(0, 0, 2), velocity=(1, 2, 3), angular_velocity=(4, 5, 6), name="cube")
+    scene.add_body(shapes.tetrahedron(), kind="static", position=(3, 0, 0))
+    scene.add_sphere(0.25, density=100.0, position=(0, 3, 1))
+    scene.add_capsule(0.1, 0.6, mass=2.0, position=(0, -3, 1))
+    scene.add_body(open_box(), kind="kinematic", velocity=(1, 0, 0), position=(-3, 0, 0), margin=0.02)
+    scene.add_ground(height=-1.0, margin=0.05)
+    packed = scene.pack(thickness=0.01)
+
+    assert packed.names == ["cube", "body_1", "body_2", "body_3", "body_4"]
+    np.testing.assert_array_equal(packed.kind, [0, 1, 0, 0, 2])
+    np.testing.assert_array_equal(packed.margin, [0.005, 0.005, 0.25, 0.1, 0.02])
+    np.testing.assert_array_equal(packed.vertex_count, [8, 4, 1, 2, 8])
+    np.testing.assert_array_equal(packed.face_count, [12, 4, 0, 0, 10])
+    assert len(packed.vertices) == 23
+    assert len(packed.faces) == 26
+    assert packed.faces[12:16].max() == 3  # local to the body
+    np.testing.assert_array_equal(packed.vertices[13:15], [[0, 0, -0.3], [0, 0, 0.3]])
+    np.testing.assert_array_equal(packed.position[0], [0, 0, 2])
+    np.testing.assert_array_equal(packed.velocity[:, 0], [1, 0, 0, 0, 1])
+    np.testing.assert_array_equal(packed.angular_velocity[0], [4, 5, 6])
+    sphere = 100.0 * 4.0 / 3.0 * math.pi * 0.25**3
+    np.testing.assert_allclose(packed.mass, [10.0, 0.0, sphere, 2.0, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(packed.inertia[0], 10.0 / 6.0 * np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(packed.inertia[2], 0.4 * sphere * 0.25**2 * np.eye(3), rtol=1e-14)
+    assert not packed.inertia[[1, 4]].any()
+    assert packed.friction.shape == packed.restitution.shape == (6,)
+    np.testing.assert_array_equal(packed.gravity, [0.1, 0.2, -9.0])
+    assert (packed.has_ground, packed.ground_height, packed.ground_margin) == (True, -1.0, 0.05)
+    assert packed.thickness == 0.01
+    expected = {"kind": np.int32, "vertex_count": np.int32, "face_count": np.int32, "faces": np.int32}
+    for field in fields(packed):
+        value = getattr(packed, field.name)
+        if isinstance(value, np.ndarray):
+            assert value.dtype == expected.get(field.name, np.float64), field.name
+            assert value.flags.c_contiguous, field.name
+    scene.validate(packed)
+    copied = pickle.loads(pickle.dumps(packed))
+    np.testing.assert_array_equal(copied.vertices, packed.vertices)
+
+
+def test_position_places_the_mesh_and_state_speaks_of_the_centre_of_mass() -> None:
+    vertices, faces = shapes.l_shape()
+    vertices += np.array([2.0, -1.0, 0.5])
+    q, position = from_rpy(np.array([0.3, -0.7, 1.9])), np.array([5.0, 6.0, 7.0])
+    packed = one_body(mesh=(vertices, faces), position=position, orientation=q)
+    np.testing.assert_allclose(packed.position[0], position + rotate(q, packed.mesh_offset[0]), rtol=1e-14)
+    world = rotate(packed.orientation[0], packed.vertices) + packed.position[0]
+    np.testing.assert_allclose(world, rotate(q, vertices) + position, atol=1e-14)
+    second = one_body(mesh=(vertices - packed.mesh_offset[0], faces))
+    np.testing.assert_allclose(second.mesh_offset, 0.0, atol=1e-14)
+    np.testing.assert_allclose(second.inertia, packed.inertia, atol=1e-12)
+
+
+def test_packed_arrays_are_the_callers_own() -> None:
+    scene = scenes.falling_cubes(2)
+    first = scene.pack()
+    for field in fields(first):
+        value = getattr(first, field.name)
+        if isinstance(value, np.ndarray):
+            value[...] = 1
+    assert scene.pack().gravity[2] == -9.81
+    assert scene.pack().position[0, 2] == 1.0
+    assert scene.pack().vertices.min() == -0.5
+
+
+def test_orientation_is_normalised() -> None:
+    packed = one_body(orientation=(1.0001, 0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(packed.orientation[0], [1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(to_matrix(one_body(orientation=(2, 0, 0, 2)).orientation[0])[0], [0, -1, 0], atol=1e-15)
+
+
+def test_default_thickness_is_a_thousandth_of_the_smallest_extent() -> None:
+    assert one_body().thickness == pytest.approx(1e-3)
+    assert one_body(mesh=shapes.box((2.0, 0.05, 1.0))).thickness == pytest.approx(5e-5)
+    assert one_body(mesh=shapes.box((2.0, 0.05, 1.0)), margin=0.1).thickness == pytest.approx(2.5e-4)
+    scene = Scene()
+    scene.add_body(CUBE, density=1.0)
+    scene.add_sphere(0.1, density=1.0, position=(2.0, 0.0, 0.0))
+    assert scene.pack().thickness == pytest.approx(2e-4)
+    scene.add_capsule(0.05, 3.0, density=1.0, position=(4.0, 0.0, 0.0))
+    assert scene.pack().thickness == pytest.approx(1e-4)
+
+
+def test_flat_static_mesh_does_not_make_the_thickness_zero() -> None:
+    flat = (np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]), np.array([[0, 1, 2]]))
+    assert one_body(mesh=flat, kind="static").thickness == pytest.approx(2e-3)
+
+
+# ---- Handles ----------------------------------------------------------------------------------------------------
+
+
+def test_handle_is_an_index_with_a_name() -> None:
+    scene = Scene()
+    first, second = scene.add_body(CUBE, density=1.0), scene.add_sphere(0.1, mass=1.0, name="ball")
+    assert (first, second) == (0, 1)
+    assert (first.name, second.name) == ("body_0", "ball")
+    assert repr(second) == "BodyHandle(1, 'ball')"
+    position = torch.arange(24.0).reshape(4, 2, 3)
+    assert torch.equal(position[..., second, :], position[:, 1])
+    assert np.arange(6).reshape(2, 3)[second, 0] == 3
+    for copied in (pickle.loads(pickle.dumps(second)), copy.deepcopy(second)):
+        assert isinstance(copied, BodyHandle)
+        assert (copied, copied.name) == (1, "ball")
+
+
+def test_made_up_names_avoid_given_ones() -> None:
+    scene = Scene()
+    scene.add_sphere(0.1, mass=1.0, name="body_1")
+    assert scene.add_sphere(0.1, mass=1.0).name == "body_2"
+
+
+def test_failed_add_leaves_the_scene_as_it_was() -> None:
+    scene = Scene()
+    with pytest.raises(ValueError, match="position"):
+        scene.add_body(CUBE, density=1.0, position=(0, 0, NAN), name="cube")
+    assert scene.add_body(CUBE, density=1.0, name="cube") == 0
+
+
+def test_scene_copies_pickles_and_prints() -> None:
+    scene = scenes.box_on_box()
+    for copied in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
+        np.testing.assert_array_equal(copied.pack().position, scene.pack().position)
+        copied.add_sphere(0.1, mass=1.0)
+    assert len(scene.pack().names) == 2
+    expected = "Scene(2 bodies: 1 dynamic, 1 static; ground at 0 m; gravity (0.0, 0.0, -9.81) m/s²)"
+    assert repr(scene) == expected
+
+
+# ---- Mass -------------------------------------------------------------------------------------------------------
+
+
+def test_mass_scales_a_uniform_density() -> None:
+    by_density, by_mass = one_body(mesh=shapes.l_shape(), density=500.0), Scene()
+    by_mass.add_body(shapes.l_shape(), mass=3.0)
+    packed = by_mass.pack()
+    assert packed.mass[0] == 3.0
+    np.testing.assert_allclose(packed.inertia[0] / 3.0, by_density.inertia[0] / by_density.mass[0], rtol=1e-14)
+
+
+def test_given_inertia_replaces_that_of_the_mesh() -> None:
+    inertia = np.array([[2.0, 0.1, 0.0], [0.1, 3.0, 0.2], [0.0, 0.2, 4.0]])
+    for arguments in ({"mass": 2.0, "density": None}, {"density": 2.0}):
+        packed = one_body(mesh=shapes.l_shape(), inertia=inertia, **arguments)
+        np.testing.assert_array_equal(packed.inertia[0], inertia)
+        assert packed.mesh_offset[0].any()
+    scene = Scene()
+    scene.add_sphere(0.1, mass=1.0, inertia=0.01 * np.eye(3))  # hollow
+    np.testing.assert_array_equal(scene.pack().inertia[0], 0.01 * np.eye(3))
+
+
+def test_open_mesh_with_mass_and_inertia_has_its_origin_as_centre_of_mass() -> None:
+    vertices, faces = open_box()
+    packed = one_body(mesh=(vertices + 1.0, faces), density=None, mass=2.0, inertia=np.eye(3))
+    assert packed.mass[0] == 2.0
+    np.testing.assert_array_equal(packed.mesh_offset, 0.0)
+    np.testing.assert_array_equal(packed.vertices, vertices + 1.0)
+
+
+def test_inward_faces_are_turned_around() -> None:
+    vertices, faces = shapes.l_shape()
+    inwards, outwards = one_body(mesh=(vertices, faces[:, ::-1])), one_body(mesh=(vertices, faces))
+    np.testing.assert_allclose(inwards.mass, outwards.mass)
+    np.testing.assert_allclose(inwards.inertia, outwards.inertia, atol=1e-12)
+    np.testing.assert_array_equal(inwards.faces, faces[:, ::-1][:, ::-1])
+
+
+def test_static_and_kinematic_bodies_need_no_mass_and_may_be_open() -> None:
+    for kind in ("static", "kinematic"):
+        for mesh in (CUBE, open_box(), (CUBE[0], CUBE[1][:, ::-1])):
+            packed = one_body(mesh=mesh, density=None, kind=kind)
+            assert packed.mass[0] == 0.0
+            assert not packed.inertia.any()
+    room = one_body(mesh=(CUBE[0], CUBE[1][:, ::-1]), kind="static")
+    np.testing.assert_array_equal(room.faces, CUBE[1][:, ::-1])  # stays a room
+
+
+# ---- Meshes -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ply", "obj", "off", "glb"])
+def test_files_are_read_with_vertices_merged(tmp_path: Path, suffix: str) -> None:
+    import trimesh
+
+    path = tmp_path / f"angle.{suffix}"
+    trimesh.Trimesh(*shapes.l_shape(), process=False).export(path)
+    for mesh in (path, str(path)):
+        packed = one_body(mesh=mesh)
+        assert (packed.vertex_count[0], packed.face_count[0]) == (12, 20)
+        assert packed.mass[0] == pytest.approx(256.0, rel=1e-6)  # formats with single precision
+
+
+def test_geometries_of_a_file_become_one_mesh(tmp_path: Path) -> None:
+    import trimesh
+
+    parts = [trimesh.Trimesh(*CUBE, process=False) for _ in range(2)]
+    parts[1].apply_translation((3.0, 0.0, 0.0))
+    path = tmp_path / "two.glb"
+    trimesh.Scene(parts).export(path)
+    packed = one_body(mesh=path)
+    assert packed.vertex_count[0] == 16
+    assert packed.mass[0] == pytest.approx(2000.0)
+    np.testing.assert_allclose(np.sort(np.ptp(packed.vertices, axis=0)), [1.0, 1.0, 4.0])
+
+
+def test_tiny_meshes_survive_a_file(tmp_path: Path) -> None:
+    import trimesh
+
+    path = tmp_path / "micro.ply"
+    trimesh.Trimesh(*shapes.icosphere(1e-7, 2), process=False).export(path)
+    assert one_body(mesh=path).vertex_count[0] == 162
+
+
+def test_trimesh_objects_and_arrays() -> None:
+    import trimesh
+
+    mesh = trimesh.Trimesh(*CUBE, process=False)
+    lists = (CUBE[0].tolist(), CUBE[1].tolist())
+    tensors = (torch.from_numpy(CUBE[0]), torch.from_numpy(CUBE[1]).long())
+    for given in (mesh, trimesh.Scene([mesh]), lists, tensors, list(CUBE)):
+        assert one_body(mesh=given).mass[0] == pytest.approx(1000.0)
+
+
+def test_unused_vertices_are_dropped() -> None:
+    vertices = np.concatenate([[[9.0, 9.0, 9.0]], CUBE[0], [[7.0, 7.0, 7.0]]])
+    packed = one_body(mesh=(vertices, CUBE[1] + 1))
+    np.testing.assert_array_equal(packed.vertices, CUBE[0])
+    np.testing.assert_array_equal(packed.faces, CUBE[1])
+
+
+def test_mesh_is_copied() -> None:
+    vertices, faces = CUBE[0].copy(), CUBE[1].copy()
+    scene = Scene()
+    scene.add_body((vertices, faces), density=1.0)
+    vertices += 1.0
+    faces[:] = 0
+    np.testing.assert_array_equal(scene.pack().vertices, CUBE[0])
+    np.testing.assert_array_equal(scene.pack().faces, CUBE[1])
+
+
+def changed(vertices: Any = None, faces: Any = None, **at: Any) -> tuple[Any, Any]:
+    """The cube with one vertex or face changed."""
+    v, f = CUBE[0].copy(), CUBE[1].copy()
+    if vertices is not None:
+        v[at["row"]] = vertices
+    if faces is not None:
+        f[at["row"]] = faces
+    return v, f
+
+
+# A face without area beside a closed cube, and a part that points inwards beside one that does not.
+SLIVER = (np.concatenate([CUBE[0], [[2, 0, 0], [3, 0, 0], [4, 0, 0]]]), np.concatenate([CUBE[1], [[8, 9, 10]]]))
+HALF_INWARD = (
+    np.concatenate([CUBE[0], 0.5 * CUBE[0] + [2.0, 0.0, 0.0]]),
+    np.concatenate([CUBE[1], CUBE[1][:, ::-1] + 8]),
+)
+FLAT_CLOSED = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]]))
+
+BAD_MESHES: list[tuple[Any, type[Exception], str]] = [
+    (open_box(), ValueError, r"the mesh is open \(6 boundary edges\).*fill_holes.*inertia=.*static"),
+    (changed(faces=CUBE[1][3][::-1], row=3), ValueError, r"not consistently oriented \(3 edges.*fix_normals"),
+    (changed(vertices=[0.0, NAN, 0.0], row=3), ValueError, r"vertex 3 is not finite: \[0\.0, nan, 0\.0\]"),
+    (changed(vertices=[INF, 0.0, 0.0], row=0), ValueError, r"vertex 0 is not finite"),
+    (changed(faces=[0, 1, 8], row=5), ValueError, r"face 5 is out of range: \[0, 1, 8\] with 8 vertices"),
+    (changed(faces=[0, 1, -1], row=5), ValueError, r"face 5 is out of range"),
+    (changed(faces=[0, 1, 1], row=5), ValueError, r"face 5 is degenerate: it repeats a vertex, \[0, 1, 1\]"),
+    (SLIVER, ValueError, r"face 12 is degenerate: area 0 m².*nondegenerate_faces"),
+    (changed(vertices=CUBE[0][1], row=0), ValueError, "degenerate"),
+    (HALF_INWARD, ValueError, "part 1 of the mesh points inwards but is no cavity"),
+    (FLAT_CLOSED, ValueError, "encloses no volume"),
+    ((CUBE[0][:, :2], CUBE[1]), ValueError, r"vertices must have shape \(n, 3\), got \(8, 2\)"),
+    ((CUBE[0], CUBE[1].reshape(-1, 4)), ValueError, r"faces must be triangles, shape \(m, 3\).*got \(9, 4\)"),
+    ((CUBE[0], CUBE[1][:0]), ValueError, "faces must be triangles"),
+    ((CUBE[0], CUBE[1].astype(float)), TypeError, "faces must be integers, got dtype float64"),
+    ((CUBE[0].astype(str), CUBE[1]), TypeError, "vertices must be numbers"),
+    (CUBE[0], TypeError, r"mesh must be a path, a trimesh.Trimesh or \(vertices, faces\), got ndarray"),
+    (None, TypeError, "got NoneType"),
+    ("no/such/file.stl", FileNotFoundError, "no/such/file.stl"),
+]
+
+
+@pytest.mark.parametrize(("mesh", "error", "message"), BAD_MESHES)
+def test_bad_meshes_are_refused_by_name(mesh: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message) as raised:
+        Scene().add_body(mesh, density=1000.0, name="thing")
+    assert str(raised.value).startswith("body 'thing': ")
+
+
+def test_cavity_is_no_part_that_points_inwards() -> None:
+    vertices = np.concatenate([CUBE[0], 0.5 * CUBE[0]])
+    faces = np.concatenate([CUBE[1], CUBE[1][:, ::-1] + 8])
+    assert one_body(mesh=(vertices, faces)).mass[0] == pytest.approx(875.0)
+    assert one_body(mesh=(vertices, faces[:, ::-1])).mass[0] == pytest.approx(875.0)
+
+
+# ---- Values -----------------------------------------------------------------------------------------------------
+
+BAD_VALUES: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"density": 0.0}, ValueError, r"density must be positive, got 0 \[kg/m³\]"),
+    ({"density": -1.0}, ValueError, "density must be positive, got -1"),
+    ({"density": NAN}, ValueError, "density must be finite, got nan"),
+    ({"density": "heavy"}, TypeError, "density must be a number, got 'heavy'"),
+    ({"density": None}, ValueError, r"needs density= \[kg/m³\] or mass= \[kg\]; or give kind='static'"),
+    ({"mass": 1.0}, ValueError, "density= or mass=, not both"),
+    ({"density": None, "mass": -2.0}, ValueError, r"mass must be positive, got -2 \[kg\]"),
+    ({"density": None, "mass": True}, TypeError, "mass must be a number, got True"),
+    ({"density": None, "inertia": np.eye(3)}, ValueError, "needs density="),
+    ({"inertia": np.eye(2)}, ValueError, r"inertia must have shape \(3, 3\), got shape \(2, 2\)"),
+    ({"inertia": np.diag([1.0, 1.0, -1.0])}, ValueError, "inertia must be positive definite.*moment -1"),
+    ({"inertia": np.diag([1.0, 1.0, 0.0])}, ValueError, "inertia must be positive definite"),
+    ({"inertia": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, ValueError, "inertia must be symmetric"),
+    ({"inertia": np.full((3, 3), NAN)}, ValueError, "inertia must be finite"),
+    ({"margin": 0.0}, ValueError, r"margin must be positive, got 0 \[m\]"),
+    ({"margin": -0.1}, ValueError, "margin must be positive"),
+    ({"position": (0, 0)}, ValueError, r"position must have shape \(3,\), got shape \(2,\)"),
+    ({"position": (0, 0, INF)}, ValueError, r"position must be finite, got \[0.0, 0.0, inf\]"),
+    ({"position": "here"}, TypeError, "position must be numbers"),
+    ({"position": [1, [2], 3]}, ValueError, "position"),
+    ({"position": torch.zeros(3, requires_grad=True)}, ValueError, r"position: .*requires grad.*detach\(\)"),
+    ({"orientation": (0, 0, 0, 0)}, ValueError, r"orientation must be a quaternion \(w, x, y, z\) other than zero"),
+    ({"orientation": (0, 0, 0)}, ValueError, r"orientation must have shape \(4,\)"),
+    ({"orientation": (NAN, 0, 0, 0)}, ValueError, "orientation must be finite"),
+    ({"velocity": (NAN, 0, 0)}, ValueError, "velocity must be finite"),
+    ({"angular_velocity": np.zeros((1, 3))}, ValueError, r"angular_velocity must have shape \(3,\)"),
+    ({"kind": "Dynamic"}, ValueError, "kind must be one of 'dynamic', 'static', 'kinematic', got 'Dynamic'"),
+    ({"kind": 1}, ValueError, "kind must be one of"),
+    ({"kind": "static", "velocity": (1, 0, 0)}, ValueError, "velocity must be zero for a static body.*'kinematic'"),
+    ({"kind": "static", "density": -1.0}, ValueError, "density must be positive"),
+    ({"friction": 0.5}, NotImplementedError, "friction=0.5 is not implemented yet: contact is frictionless"),
+    ({"friction": -0.5}, ValueError, "friction must not be negative"),
+    ({"friction": NAN}, ValueError, "friction must be finite"),
+    ({"restitution": 0.5}, NotImplementedError, "restitution=0.5 is not implemented yet"),
+    ({"restitution": 1.5}, ValueError, "restitution must lie between 0 and 1"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "error", "message"), BAD_VALUES)
+def test_bad_values_are_refused_by_name(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+    given = {"density": 1000.0, **arguments}
+    for add in (lambda scene: scene.add_body(CUBE, name="thing", **given), _add_sphere(given)):
+        if add is not None:
+            scene = Scene()
+            with pytest.raises(error, match=message) as raised:
+                add(scene)
+            assert str(raised.value).startswith("body 'thing': ")
+            assert scene.pack().names == []
+
+
+def _add_sphere(given: dict[str, Any]) -> Any:
+    return None if "margin" in given else lambda scene: scene.add_sphere(0.5, name="thing", **given)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, NAN, "big", None])
+def test_bad_radius_and_length(radius: Any) -> None:
+    for add in (
+        lambda scene: scene.add_sphere(radius, mass=1.0, name="thing"),
+        lambda scene: scene.add_capsule(radius, 1.0, mass=1.0, name="thing"),
+        lambda scene: scene.add_capsule(1.0, radius, mass=1.0, name="thing"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=r"body 'thing': (radius|length) must be"):
+            add(Scene())
+
+
+def test_bad_names() -> None:
+    scene = Scene()
+    scene.add_body(CUBE, density=1.0, name="cube")
+    with pytest.raises(ValueError, match="body 'cube': the name is already in use"):
+        scene.add_sphere(1.0, mass=1.0, name="cube")
+    with pytest.raises(ValueError, match="body 1: name must not be empty"):
+        scene.add_sphere(1.0, mass=1.0, name="")
+    with pytest.raises(TypeError, match="body 1: name must be a string, got int"):
+        scene.add_sphere(1.0, mass=1.0, name=3)  # type: ignore[arg-type]
+
+
+def test_bad_gravity_ground_and_thickness() -> None:
+    with pytest.raises(ValueError, match="Scene: gravity must be finite"):
+        Scene(gravity=(0.0, 0.0, NAN))
+    with pytest.raises(ValueError, match=r"Scene: gravity must have shape \(3,\), got shape \(\)"):
+        Scene(gravity=-9.81)
+    scene = Scene()
+    with pytest.raises(ValueError, match="ground: height must be finite"):
+        scene.add_ground(height=INF)
+    with pytest.raises(ValueError, match="ground: margin must be positive"):
+        scene.add_ground(margin=-1.0)
+    with pytest.raises(NotImplementedError, match=r"ground: friction=0\.3 is not implemented yet"):
+        scene.add_ground(friction=0.3)
+    scene.add_ground(height=1.5)
+    with pytest.raises(ValueError, match=re.escape("already has a ground, at height 1.5 m")):
+        scene.add_ground()
+    for thickness in (0.0, -1e-3, NAN):
+        with pytest.raises(ValueError, match="thickness must be"):
+            scene.pack(thickness)
+
+
+def test_cloth_is_announced_as_missing() -> None:
+    with pytest.raises(NotImplementedError, match="add_cloth: cloth is not implemented yet"):
+        Scene().add_cloth(CUBE, pinned=[0])
+
+
+def test_validate_refuses_the_arrays_of_another_scene() -> None:
+    scene = scenes.falling_cubes(2)
+    packed = scene.pack()
+    scene.add_sphere(0.1, mass=1.0)
+    with pytest.raises(ValueError, match="another scene, or bodies have been added"):
+        scene.validate(packed)
+
+
+# ---- Shared scenes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", scenes.__all__)
+def test_shared_scenes_start_free_of_overlap(name: str) -> None:
+    scene = getattr(scenes, name)()
+    packed = scene.pack()
+    assert packed.kind.tolist().count(0) >= 1
+    scene.validate(packed)
+
+
+def test_shared_scenes_take_their_size() -> None:
+    assert len(scenes.falling_cubes(7).pack().names) == 7
+    assert len(scenes.row_of_cubes(7).pack().names) == 7
+    assert len(scenes.two_layer_stack(7).pack().names) == 13
+    assert scenes.falling_cubes(1).pack().vertices.shape == (8, 3)
+    free = scenes.box_on_box(fixed=False)
+    free.validate(free.pack())
