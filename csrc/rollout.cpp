@@ -60,8 +60,8 @@ void for_each_scene(int batch, int thread_count, const Work& work) {
 // --- inputs --------------------------------------------------------------------------------------------------------
 
 [[noreturn]] void refuse(const std::string& field, const Model& model, int body, const std::string& problem) {
-    throw std::invalid_argument(field + " of body '" + model.name(body) + "' (index " + std::to_string(body) + ") " +
-                                problem);
+    throw std::invalid_argument(
+        field + " of body '" + model.name(body) + "' (index " + std::to_string(body) + ") " + problem);
 }
 
 template <typename Vector>
@@ -86,8 +86,9 @@ SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
         require_finite("state.angular_velocity", model, i, body.angular_velocity);
         const double norm = body.orientation.norm();
         if (!(std::abs(norm - 1.0) <= kUnitTolerance))
-            refuse("state.orientation", model, i,
-                   "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) + "; divide it by its norm");
+            refuse(
+                "state.orientation", model, i,
+                "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) + "; divide it by its norm");
         if (std::abs(norm - 1.0) > 4.0 * kEpsilon) body.orientation /= norm;  // bits of our own states stay
     }
     return state;
@@ -113,8 +114,8 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
     return parameters;
 }
 
-void read_control(const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state,
-                  SceneControl& control) {
+void read_control(
+    const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state, SceneControl& control) {
     control.resize(model.bodies.size());
     const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise) {
         if (!view.present()) return otherwise;
@@ -160,12 +161,13 @@ void merge_info(StepInfo& total, const StepInfo& scene) {
 /// Gradients of one scene, in the order of the inputs, controls for one step or for all.
 struct SceneGradient {
     std::vector<BodyStateGradient> state;
-    std::vector<std::vector<BodyControlGradient>> control;  // per step
+    std::vector<std::vector<BodyControlGradient>> control;  // per step; empty unless asked for
     ParameterGradient parameters;
 };
 
-void add_upstream(const Tape& tape, const TrajectoryArrays<const double>& upstream, int time, int scene,
-                  const SceneState& end, std::vector<BodyStateGradient>& gradient) {
+void add_upstream(
+    const TrajectoryArrays<const double>& upstream, int time, int scene, const SceneState& end,
+    std::vector<BodyStateGradient>& gradient) {
     for (int i = 0; i < static_cast<int>(gradient.size()); ++i) {
         BodyStateGradient& g = gradient[i];
         if (upstream.position.present()) g.position += row<3>(upstream.position.at(time, scene), i);
@@ -173,10 +175,9 @@ void add_upstream(const Tape& tape, const TrajectoryArrays<const double>& upstre
         if (upstream.angular_velocity.present())
             g.angular_velocity += row<3>(upstream.angular_velocity.at(time, scene), i);
         if (upstream.orientation.present())
-            g.orientation += quaternion_gradient_to_covector(end[i].orientation,
-                                                             row<4>(upstream.orientation.at(time, scene), i));
+            g.orientation +=
+                quaternion_gradient_to_covector(end[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
     }
-    (void)tape;
 }
 
 /// State at the end of a recorded step: the start of the next one, or for the last step the same arithmetic again.
@@ -185,6 +186,7 @@ SceneState end_state(const Tape& tape, int scene, int time) {
     if (time + 1 < static_cast<int>(records.size())) return records[time + 1].start;
     const StepRecord& record = records[time];
     SceneState end = record.start;
+    if (record.held) return end;
     for (std::size_t i = 0; i < end.size(); ++i) {
         const Vec3 turn = record.y[i].head<3>();
         if (turn.isZero(0.0)) continue;
@@ -194,29 +196,32 @@ SceneState end_state(const Tape& tape, int scene, int time) {
     return end;
 }
 
-SceneGradient scene_backward(const Tape& tape, const RolloutInputs& inputs,
-                             const TrajectoryArrays<const double>& upstream, int scene) {
+SceneGradient scene_backward(
+    const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream, int scene,
+    bool keep_controls) {
     const Model& model = *tape.model;
     const std::size_t count = model.bodies.size();
     const Parameters parameters = read_parameters(model, inputs, scene);
     SceneGradient gradient;
     gradient.state.resize(count);
-    gradient.control.resize(static_cast<std::size_t>(tape.shape.steps));
+    if (keep_controls) gradient.control.resize(static_cast<std::size_t>(tape.shape.steps));
     gradient.parameters.mass.assign(count, 0.0);
     gradient.parameters.inertia.assign(count, Mat3::Zero());
     StepWorkspace workspace;
     SceneControl control;
+    std::vector<BodyControlGradient> scratch;
     for (int time = tape.shape.steps - 1; time >= 0; --time) {
         const bool last = time == tape.shape.steps - 1;
         if (tape.shape.keep_time || last)
-            add_upstream(tape, upstream, tape.shape.keep_time ? time : 0, scene, end_state(tape, scene, time),
-                         gradient.state);
+            add_upstream(
+                upstream, tape.shape.keep_time ? time : 0, scene, end_state(tape, scene, time), gradient.state);
         const StepRecord& record = tape.records[scene][time];
         read_control(model, inputs, time, scene, record.start, control);
-        std::vector<BodyControlGradient>& control_gradient = gradient.control[time];
-        control_gradient.resize(count);
-        step_backward(model, tape.options, parameters, control, record, workspace, gradient.state, control_gradient,
-                      gradient.parameters);
+        std::vector<BodyControlGradient>& control_gradient = keep_controls ? gradient.control[time] : scratch;
+        control_gradient.assign(count, BodyControlGradient{});
+        step_backward(
+            model, tape.options, parameters, control, record, workspace, gradient.state, control_gradient,
+            gradient.parameters);
         // Where a kinematic body was not driven, its own velocity drove it.
         for (std::size_t i = 0; i < count; ++i) {
             if (model.bodies[i].kind != BodyKind::kinematic) continue;
@@ -228,8 +233,9 @@ SceneGradient scene_backward(const Tape& tape, const RolloutInputs& inputs,
     return gradient;
 }
 
-void write_gradient(const Tape& tape, const RolloutInputs& inputs, const RolloutArrays<double>& out, int scene,
-                    const SceneGradient& gradient) {
+void write_gradient(
+    const Tape& tape, const RolloutInputs& inputs, const RolloutArrays<double>& out, int scene,
+    const SceneGradient& gradient) {
     const int count = tape.model->body_count();
     const auto add3 = [](const BatchedView<double>& view, int time, int batch, int body, const Vec3& value) {
         if (view.present()) row<3>(view.at(time, batch), body) += value;
@@ -244,10 +250,9 @@ void write_gradient(const Tape& tape, const RolloutInputs& inputs, const Rollout
             row<4>(out.orientation.at(0, scene), i) += covector_to_quaternion_gradient(given, g.orientation);
         }
         if (out.mass.present()) out.mass.at(0, scene)[i] += gradient.parameters.mass[i];
-        if (out.inertia.present())
-            Eigen::Map<Mat3>(out.inertia.at(0, scene) + 9 * i) += gradient.parameters.inertia[i];
+        if (out.inertia.present()) Eigen::Map<Mat3>(out.inertia.at(0, scene) + 9 * i) += gradient.parameters.inertia[i];
         const bool kinematic = tape.model->bodies[i].kind == BodyKind::kinematic;
-        for (int time = 0; time < tape.shape.steps; ++time) {
+        for (int time = 0; time < static_cast<int>(gradient.control.size()); ++time) {
             const BodyControlGradient& c = gradient.control[time][i];
             if (kinematic) {
                 add3(out.body_velocity, time, scene, i, c.velocity);
@@ -270,9 +275,10 @@ std::size_t Tape::bytes() const {
     return total;
 }
 
-RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
-                    const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory,
-                    std::vector<std::uint64_t>& signatures, Tape* tape, int thread_count) {
+RolloutInfo rollout(
+    const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
+    const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory, std::vector<std::uint64_t>& signatures,
+    Tape* tape, int thread_count) {
     const auto begin = std::chrono::steady_clock::now();
     if (tape != nullptr) {
         tape->model = model;
@@ -292,10 +298,16 @@ RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& op
         for (int time = 0; time < shape.steps; ++time) {
             read_control(*model, inputs, time, scene, state, control);
             StepRecord* record = tape != nullptr ? &tape->records[scene][time] : nullptr;
-            state = step(*model, options, parameters, state, control, workspace, info.last, record);
+            try {
+                state = step(*model, options, parameters, state, control, workspace, info.last, record);
+            } catch (const PenetratingStart&) {
+                if (time == 0) throw;  // the caller's state, not ours
+                state = hold(state, info.last, record);
+            }
             if (!info.last.converged && info.failed_steps++ == 0) info.status = info.last.status;
-            signatures[static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +
-                       static_cast<std::size_t>(scene)] = info.last.signature;
+            signatures
+                [static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +
+                 static_cast<std::size_t>(scene)] = info.last.signature;
             if (shape.keep_time) write_state(state, trajectory, time, scene);
         }
         if (!shape.keep_time) write_state(state, trajectory, 0, scene);
@@ -311,11 +323,15 @@ RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& op
     return total;
 }
 
-void rollout_backward(const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
-                      const RolloutArrays<double>& gradient, int thread_count) {
+void rollout_backward(
+    const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
+    const RolloutArrays<double>& gradient, int thread_count) {
     std::vector<SceneGradient> scenes(static_cast<std::size_t>(tape.shape.batch));
-    for_each_scene(tape.shape.batch, thread_count,
-                   [&](int scene, int) { scenes[scene] = scene_backward(tape, inputs, upstream, scene); });
+    const bool keep_controls = gradient.force.present() || gradient.torque.present() ||
+                               gradient.body_velocity.present() || gradient.body_angular_velocity.present();
+    for_each_scene(tape.shape.batch, thread_count, [&](int scene, int) {
+        scenes[scene] = scene_backward(tape, inputs, upstream, scene, keep_controls);
+    });
     // Inputs that scenes share get the sum over the scenes, in their order.
     for (int scene = 0; scene < tape.shape.batch; ++scene) write_gradient(tape, inputs, gradient, scene, scenes[scene]);
 }

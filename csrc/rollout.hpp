@@ -12,7 +12,7 @@ namespace diffsim {
 /// A row-major array with an optional time and an optional batch axis in front; stride 0 where it lacks one.
 template <typename T>
 struct BatchedView {
-    T* data = nullptr;  ///< null: not given
+    T* data = nullptr;                                 ///< null: not given
     std::ptrdiff_t time_stride = 0, batch_stride = 0;  ///< in numbers
 
     bool present() const { return data != nullptr; }
@@ -22,7 +22,7 @@ struct BatchedView {
 /// The inputs of a rollout, or gradients of the same shapes.
 template <typename T>
 struct RolloutArrays {
-    BatchedView<T> position, orientation, velocity, angular_velocity;   // state: n x 3, n x 4, n x 3, n x 3
+    BatchedView<T> position, orientation, velocity, angular_velocity;    // state: n x 3, n x 4, n x 3, n x 3
     BatchedView<T> force, torque, body_velocity, body_angular_velocity;  // controls, n x 3 each
     BatchedView<T> mass, inertia, gravity;                               // n, n x 3 x 3, 3
 };
@@ -37,7 +37,7 @@ struct TrajectoryArrays {
 struct RolloutShape {
     int steps = 1;
     int batch = 1;
-    bool keep_time = false;          ///< the trajectory has all steps, or the last state only
+    bool keep_time = false;           ///< the trajectory has all steps, or the last state only
     bool controls_have_time = false;  ///< the controls' arrays have a time axis
 };
 
@@ -62,13 +62,15 @@ struct RolloutInfo {
 /// Advance `shape.batch` scenes by `shape.steps`, on up to `thread_count` threads; the result does not depend on it.
 /// `signatures`, steps x batch, receives a hash of each step's active contacts. Throws std::invalid_argument on values
 /// that make no sense, naming the body, the field and the value.
-RolloutInfo rollout(const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
-                    const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory,
-                    std::vector<std::uint64_t>& signatures, Tape* tape, int thread_count);
+RolloutInfo rollout(
+    const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
+    const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory, std::vector<std::uint64_t>& signatures,
+    Tape* tape, int thread_count);
 
 /// d(loss)/d(inputs) from d(loss)/d(trajectory). `inputs` are those of the forward; gradient arrays that are present
 /// are overwritten, the others cost nothing to speak of.
-void rollout_backward(const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
-                      const RolloutArrays<double>& gradient, int thread_count);
+void rollout_backward(
+    const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
+    const RolloutArrays<double>& gradient, int thread_count);
 
 }  // namespace diffsim

@@ -1,6 +1,8 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
+#include <stdexcept>
 #include <vector>
 
 #include "contact/zone_solver.hpp"
@@ -13,6 +15,7 @@ namespace diffsim {
 /// What the backward of a step needs: O(bodies + contacts).
 struct StepRecord {
     SceneState start;
+    bool held = false;                        ///< nothing moved, see hold(); the rest is empty
     std::vector<FreeRotation> free_rotation;  ///< one per body
     Coordinates y;                            ///< one per body: the motion (turn, shift) of the step
     /// Dynamic bodies in contact, zone after zone, and the active contacts of each zone.
@@ -35,16 +38,43 @@ struct StepInfo {
     std::uint64_t signature = 0;  ///< hash of the active contacts and their types
 };
 
+/// A dynamic body at the start of a step, in the world frame: with R0 I_b R0ᵀ, the motion nothing hinders as target and
+/// last step's motion as warm start.
+ZoneBody moving_body(
+    int id, const BodyState& state, const BodyControl& control, const Parameters& parameters,
+    const FreeRotation& rotation, double dt);
+
+/// Velocity at the end of a step in which nothing touches the body: v0 + dt (g + f / m).
+inline Vec3 free_velocity(
+    int id, const BodyState& state, const BodyControl& control, const Parameters& parameters, double dt) {
+    return state.velocity + dt * (parameters.gravity + control.force / parameters.mass[id]);
+}
+
+/// Objects penetrate in the state a step was to start from; says which.
+class PenetratingStart : public std::invalid_argument {
+    using std::invalid_argument::invalid_argument;
+};
+
 /// Memory that steps reuse. One per thread.
-struct StepWorkspace {
+class StepWorkspace {
+public:
+    StepWorkspace();
+    ~StepWorkspace();
+
     ZoneWorkspace zone;
-    std::vector<Box> boxes, visited;
+    Zone zone_problem;
+    struct ForwardScratch;
+    std::unique_ptr<ForwardScratch> forward;
 };
 
 /// Advance by options.dt. `record`, if given, receives what step_backward needs; it does not change the result.
-/// Throws std::invalid_argument if objects are nearer than their pole at the start.
-SceneState step(const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
-                const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record);
+/// Throws PenetratingStart if objects penetrate at the start.
+SceneState step(
+    const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
+    const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record);
+
+/// What a rollout puts in place of a step from a state that penetrates: the state, unchanged and not converged.
+SceneState hold(const SceneState& state, StepInfo& info, StepRecord* record);
 
 /// d(loss)/d(BodyControl).
 using BodyControlGradient = BodyControl;
@@ -56,21 +86,10 @@ struct ParameterGradient {
 };
 
 /// Carry the gradient at the end of a step back to its start. `gradient` is overwritten; control and parameter
-/// gradients are added to. `wants_inertia` false skips what only the inertia needs.
-void step_backward(const Model& model, const Options& options, const Parameters& parameters,
-                   const SceneControl& control, const StepRecord& record, StepWorkspace& workspace,
-                   std::vector<BodyStateGradient>& gradient, std::vector<BodyControlGradient>& control_gradient,
-                   ParameterGradient& parameter_gradient);
-
-/// The state with dynamic bodies that touch, or are nearer than they rest, moved apart (contact/separation.hpp).
-SceneState separate_state(const Model& model, const Options& options, const Parameters& parameters,
-                          const SceneState& state);
-
-/// Smallest distance between the collision surfaces of any two objects, at least one of which is dynamic or kinematic.
-struct NearestObjects {
-    double distance = kInfinity;
-    int a = kNobody, b = kNobody;
-};
-NearestObjects nearest_objects(const Model& model, const SceneState& state);
+/// gradients are added to.
+void step_backward(
+    const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
+    const StepRecord& record, StepWorkspace& workspace, std::vector<BodyStateGradient>& gradient,
+    std::vector<BodyControlGradient>& control_gradient, ParameterGradient& parameter_gradient);
 
 }  // namespace diffsim

@@ -32,8 +32,8 @@ inline void check_core(const char* name, const Array& array, const std::vector<p
     const std::vector<py::ssize_t> shape = shape_of(array);
     const bool fits = shape.size() >= core.size() && std::equal(core.rbegin(), core.rend(), shape.rbegin());
     if (!fits)
-        throw std::invalid_argument(std::string(name) + " must have trailing shape " + shape_text(core) + ", got " +
-                                    shape_text(shape));
+        throw std::invalid_argument(
+            std::string(name) + " must have trailing shape " + shape_text(core) + ", got " + shape_text(shape));
 }
 
 }  // namespace diffsim::bindings

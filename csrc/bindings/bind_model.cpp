@@ -10,10 +10,10 @@ namespace {
 
 using IntArray = py::array_t<std::int32_t, py::array::c_style>;
 
-std::shared_ptr<Model> make_model(const std::vector<std::string>& names, const IntArray& kind, const Array& margin,
-                                  const IntArray& vertex_count, const Array& vertices, const IntArray& face_count,
-                                  const IntArray& faces, bool has_ground, double ground_height, double ground_margin,
-                                  double thickness) {
+std::shared_ptr<Model> make_model(
+    const std::vector<std::string>& names, const IntArray& kind, const Array& margin, const IntArray& vertex_count,
+    const Array& vertices, const IntArray& face_count, const IntArray& faces, bool has_ground, double ground_height,
+    double ground_margin, double thickness) {
     const py::ssize_t count = static_cast<py::ssize_t>(names.size());
     if (kind.size() != count || margin.size() != count || vertex_count.size() != count || face_count.size() != count)
         throw std::invalid_argument("Model: kind, margin, vertex_count and face_count must have one entry per name");
@@ -62,20 +62,23 @@ const char* adjoint_text(AdjointMode mode) {
 
 void bind_model(py::module_& module) {
     py::class_<Model, std::shared_ptr<Model>>(module, "Model", "Bodies, their collision meshes and the ground.")
-        .def(py::init(&make_model), py::kw_only(), py::arg("names"), py::arg("kind").noconvert(),
-             py::arg("margin").noconvert(), py::arg("vertex_count").noconvert(), py::arg("vertices").noconvert(),
-             py::arg("face_count").noconvert(), py::arg("faces").noconvert(), py::arg("has_ground"),
-             py::arg("ground_height"), py::arg("ground_margin"), py::arg("thickness"))
+        .def(
+            py::init(&make_model), py::kw_only(), py::arg("names"), py::arg("kind").noconvert(),
+            py::arg("margin").noconvert(), py::arg("vertex_count").noconvert(), py::arg("vertices").noconvert(),
+            py::arg("face_count").noconvert(), py::arg("faces").noconvert(), py::arg("has_ground"),
+            py::arg("ground_height"), py::arg("ground_margin"), py::arg("thickness"))
         .def_property_readonly("body_count", &Model::body_count);
 
     const Options defaults;
     py::class_<Options>(module, "Options", "How steps are taken.")
-        .def(py::init([](double dt, double compliance, const std::string& adjoint, double tolerance, int max_iterations) {
-                 return Options{dt, compliance, parse_adjoint(adjoint), tolerance, max_iterations};
-             }),
-             py::kw_only(), py::arg("dt"), py::arg("compliance") = defaults.compliance,
-             py::arg("adjoint") = adjoint_text(defaults.adjoint), py::arg("tolerance") = defaults.tolerance,
-             py::arg("max_iterations") = defaults.max_iterations)
+        .def(
+            py::init(
+                [](double dt, double compliance, const std::string& adjoint, double tolerance, int max_iterations) {
+                    return Options{dt, compliance, parse_adjoint(adjoint), tolerance, max_iterations};
+                }),
+            py::kw_only(), py::arg("dt"), py::arg("compliance") = defaults.compliance,
+            py::arg("adjoint") = adjoint_text(defaults.adjoint), py::arg("tolerance") = defaults.tolerance,
+            py::arg("max_iterations") = defaults.max_iterations)
         .def_readwrite("dt", &Options::dt)
         .def_readwrite("compliance", &Options::compliance)
         .def_readwrite("tolerance", &Options::tolerance)

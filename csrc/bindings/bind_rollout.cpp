@@ -6,6 +6,7 @@
 
 #include "bindings/arrays.hpp"
 #include "bindings/bindings.hpp"
+#include "scene_queries.hpp"
 
 namespace diffsim::bindings {
 namespace {
@@ -20,24 +21,25 @@ struct Field {
 };
 
 std::array<Field, 11> input_fields(py::ssize_t n) {
-    return {{{"position", {n, 3}, false},
-             {"orientation", {n, 4}, false},
-             {"velocity", {n, 3}, false},
-             {"angular_velocity", {n, 3}, false},
-             {"force", {n, 3}, true},
-             {"torque", {n, 3}, true},
-             {"body_velocity", {n, 3}, true},
-             {"body_angular_velocity", {n, 3}, true},
-             {"mass", {n}, false},
-             {"inertia", {n, 3, 3}, false},
-             {"gravity", {3}, false}}};
+    return {
+        {{"position", {n, 3}, false},
+         {"orientation", {n, 4}, false},
+         {"velocity", {n, 3}, false},
+         {"angular_velocity", {n, 3}, false},
+         {"force", {n, 3}, true},
+         {"torque", {n, 3}, true},
+         {"body_velocity", {n, 3}, true},
+         {"body_angular_velocity", {n, 3}, true},
+         {"mass", {n}, false},
+         {"inertia", {n, 3, 3}, false},
+         {"gravity", {3}, false}}};
 }
 
 template <typename T>
 std::array<BatchedView<T>*, 11> members(RolloutArrays<T>& arrays) {
-    return {&arrays.position,      &arrays.orientation,           &arrays.velocity, &arrays.angular_velocity,
-            &arrays.force,         &arrays.torque,                &arrays.body_velocity,
-            &arrays.body_angular_velocity, &arrays.mass,          &arrays.inertia,  &arrays.gravity};
+    return {&arrays.position, &arrays.orientation, &arrays.velocity,      &arrays.angular_velocity,
+            &arrays.force,    &arrays.torque,      &arrays.body_velocity, &arrays.body_angular_velocity,
+            &arrays.mass,     &arrays.inertia,     &arrays.gravity};
 }
 
 py::ssize_t product(const Shape& shape) {
@@ -54,8 +56,9 @@ struct Leading {
     py::ssize_t batch = 1;
 };
 
-Leading find_leading(const std::array<OptionalArray, 11>& arrays, const std::array<Field, 11>& fields, int steps,
-                     bool controls_have_time) {
+Leading find_leading(
+    const std::array<OptionalArray, 11>& arrays, const std::array<Field, 11>& fields, int steps,
+    bool controls_have_time) {
     Leading leading;
     leading.steps = steps;
     leading.has_time = controls_have_time;
@@ -66,16 +69,19 @@ Leading find_leading(const std::array<OptionalArray, 11>& arrays, const std::arr
         const bool has_time = fields[k].is_control && controls_have_time;
         const py::ssize_t extra = array.ndim() - static_cast<py::ssize_t>(fields[k].core.size());
         if (extra < (has_time ? 1 : 0) || extra > (has_time ? 2 : 1))
-            throw std::invalid_argument(std::string(fields[k].name) + " has too few or too many leading axes, shape " +
-                                        shape_text(shape_of(array)));
+            throw std::invalid_argument(
+                std::string(fields[k].name) + " has too few or too many leading axes, shape " +
+                shape_text(shape_of(array)));
         if (has_time && array.shape(0) != steps)
-            throw std::invalid_argument(std::string(fields[k].name) + " must have " + std::to_string(steps) +
-                                        " entries along its time axis, got " + std::to_string(array.shape(0)));
+            throw std::invalid_argument(
+                std::string(fields[k].name) + " must have " + std::to_string(steps) +
+                " entries along its time axis, got " + std::to_string(array.shape(0)));
         if (extra == (has_time ? 2 : 1)) {
             const py::ssize_t batch = array.shape(has_time ? 1 : 0);
             if (leading.has_batch && batch != leading.batch)
-                throw std::invalid_argument(std::string(fields[k].name) + " must have batch size " +
-                                            std::to_string(leading.batch) + ", got " + std::to_string(batch));
+                throw std::invalid_argument(
+                    std::string(fields[k].name) + " must have batch size " + std::to_string(leading.batch) + ", got " +
+                    std::to_string(batch));
             leading.has_batch = true;
             leading.batch = batch;
         }
@@ -92,8 +98,8 @@ BatchedView<T> view_of(T* data, const Field& field, py::ssize_t ndim, const Lead
     return {data, has_time ? size * (has_batch ? leading.batch : 1) : 0, has_batch ? size : 0};
 }
 
-RolloutInputs views_of(const std::array<OptionalArray, 11>& arrays, const std::array<Field, 11>& fields,
-                       const Leading& leading) {
+RolloutInputs views_of(
+    const std::array<OptionalArray, 11>& arrays, const std::array<Field, 11>& fields, const Leading& leading) {
     RolloutInputs inputs;
     const auto slots = members(inputs);
     for (std::size_t k = 0; k < fields.size(); ++k)
@@ -123,23 +129,28 @@ struct Rollout {
     py::array_t<std::uint64_t> signature;
 };
 
-Rollout bound_rollout(const std::shared_ptr<Model>& model, const Options& options, const Array& position,
-                      const Array& orientation, const Array& velocity, const Array& angular_velocity,
-                      const OptionalArray& force, const OptionalArray& torque, const OptionalArray& body_velocity,
-                      const OptionalArray& body_angular_velocity, const Array& mass, const Array& inertia,
-                      const Array& gravity, int steps, bool controls_have_time, bool keep_time, bool record,
-                      int num_threads) {
+Rollout bound_rollout(
+    const std::shared_ptr<Model>& model, const Options& options, const Array& position, const Array& orientation,
+    const Array& velocity, const Array& angular_velocity, const OptionalArray& force, const OptionalArray& torque,
+    const OptionalArray& body_velocity, const OptionalArray& body_angular_velocity, const Array& mass,
+    const Array& inertia, const Array& gravity, int steps, bool controls_have_time, bool keep_time, bool record,
+    int num_threads) {
     if (steps < 1) throw std::invalid_argument("steps must be at least 1");
     const py::ssize_t n = model->body_count();
-    const std::array<OptionalArray, 11> arrays = {position, orientation,   velocity,
-                                                  angular_velocity, force, torque,
-                                                  body_velocity, body_angular_velocity, mass, inertia, gravity};
+    const std::array<OptionalArray, 11> arrays = {position, orientation, velocity,      angular_velocity,
+                                                  force,    torque,      body_velocity, body_angular_velocity,
+                                                  mass,     inertia,     gravity};
     const std::array<Field, 11> fields = input_fields(n);
     const Leading leading = find_leading(arrays, fields, steps, controls_have_time);
     const RolloutInputs inputs = views_of(arrays, fields, leading);
-    Rollout result{Array(trajectory_shape(leading, keep_time, n, 3)), Array(trajectory_shape(leading, keep_time, n, 4)),
-                   Array(trajectory_shape(leading, keep_time, n, 3)), Array(trajectory_shape(leading, keep_time, n, 3)),
-                   record ? std::make_shared<Tape>() : nullptr, {}, {}};
+    Rollout result{
+        Array(trajectory_shape(leading, keep_time, n, 3)),
+        Array(trajectory_shape(leading, keep_time, n, 4)),
+        Array(trajectory_shape(leading, keep_time, n, 3)),
+        Array(trajectory_shape(leading, keep_time, n, 3)),
+        record ? std::make_shared<Tape>() : nullptr,
+        {},
+        {}};
     const TrajectoryArrays<double> trajectory{
         trajectory_view(result.position.mutable_data(), leading, keep_time, n, 3),
         trajectory_view(result.orientation.mutable_data(), leading, keep_time, n, 4),
@@ -158,18 +169,17 @@ Rollout bound_rollout(const std::shared_ptr<Model>& model, const Options& option
     return result;
 }
 
-py::tuple bound_backward(const std::shared_ptr<Tape>& tape, const Array& position, const Array& orientation,
-                         const Array& velocity, const Array& angular_velocity, const OptionalArray& force,
-                         const OptionalArray& torque, const OptionalArray& body_velocity,
-                         const OptionalArray& body_angular_velocity, const Array& mass, const Array& inertia,
-                         const Array& gravity, const OptionalArray& grad_position,
-                         const OptionalArray& grad_orientation, const OptionalArray& grad_velocity,
-                         const OptionalArray& grad_angular_velocity, const std::array<bool, 11>& needs,
-                         int num_threads) {
+py::tuple bound_backward(
+    const std::shared_ptr<Tape>& tape, const Array& position, const Array& orientation, const Array& velocity,
+    const Array& angular_velocity, const OptionalArray& force, const OptionalArray& torque,
+    const OptionalArray& body_velocity, const OptionalArray& body_angular_velocity, const Array& mass,
+    const Array& inertia, const Array& gravity, const OptionalArray& grad_position,
+    const OptionalArray& grad_orientation, const OptionalArray& grad_velocity,
+    const OptionalArray& grad_angular_velocity, const std::array<bool, 11>& needs, int num_threads) {
     const py::ssize_t n = tape->model->body_count();
-    const std::array<OptionalArray, 11> arrays = {position, orientation,   velocity,
-                                                  angular_velocity, force, torque,
-                                                  body_velocity, body_angular_velocity, mass, inertia, gravity};
+    const std::array<OptionalArray, 11> arrays = {position, orientation, velocity,      angular_velocity,
+                                                  force,    torque,      body_velocity, body_angular_velocity,
+                                                  mass,     inertia,     gravity};
     const std::array<Field, 11> fields = input_fields(n);
     const Leading leading = find_leading(arrays, fields, tape->shape.steps, tape->shape.controls_have_time);
     if (leading.batch != tape->shape.batch)
@@ -183,8 +193,9 @@ py::tuple bound_backward(const std::shared_ptr<Tape>& tape, const Array& positio
         if (!array) return;
         const Shape expected = trajectory_shape(leading, keep_time, n, width);
         if (shape_of(*array) != expected)
-            throw std::invalid_argument(std::string(name) + " must have shape " + shape_text(expected) + ", got " +
-                                        shape_text(shape_of(*array)));
+            throw std::invalid_argument(
+                std::string(name) + " must have shape " + shape_text(expected) + ", got " +
+                shape_text(shape_of(*array)));
         view = trajectory_view(array->data(), leading, keep_time, n, width);
     };
     read_upstream("grad_position", grad_position, 3, upstream.position);
@@ -228,8 +239,9 @@ py::tuple bound_min_distance(const Model& model, const Array& position, const Ar
     return py::make_tuple(nearest.distance, nearest.a, nearest.b);
 }
 
-py::tuple bound_separate(const Model& model, const Options& options, const Array& position, const Array& orientation,
-                         const Array& mass, const Array& inertia) {
+py::tuple bound_separate(
+    const Model& model, const Options& options, const Array& position, const Array& orientation, const Array& mass,
+    const Array& inertia) {
     const py::ssize_t n = model.body_count();
     const SceneState state = scene_state(model, position, orientation);
     if (shape_of(mass) != Shape{n} || shape_of(inertia) != Shape{n, 3, 3})
@@ -303,29 +315,33 @@ void bind_rollout(py::module_& module) {
         .def_readonly("info", &Rollout::info)
         .def_readonly("signature", &Rollout::signature);
 
-    module.def("rollout", &bound_rollout, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
-               py::arg("orientation").noconvert(), py::arg("velocity").noconvert(),
-               py::arg("angular_velocity").noconvert(), py::arg("force").noconvert().none(true),
-               py::arg("torque").noconvert().none(true), py::arg("body_velocity").noconvert().none(true),
-               py::arg("body_angular_velocity").noconvert().none(true), py::arg("mass").noconvert(),
-               py::arg("inertia").noconvert(), py::arg("gravity").noconvert(), py::kw_only(), py::arg("steps"),
-               py::arg("controls_have_time"), py::arg("keep_time"), py::arg("record"), py::arg("num_threads"));
+    module.def(
+        "rollout", &bound_rollout, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
+        py::arg("orientation").noconvert(), py::arg("velocity").noconvert(), py::arg("angular_velocity").noconvert(),
+        py::arg("force").noconvert().none(true), py::arg("torque").noconvert().none(true),
+        py::arg("body_velocity").noconvert().none(true), py::arg("body_angular_velocity").noconvert().none(true),
+        py::arg("mass").noconvert(), py::arg("inertia").noconvert(), py::arg("gravity").noconvert(), py::kw_only(),
+        py::arg("steps"), py::arg("controls_have_time"), py::arg("keep_time"), py::arg("record"),
+        py::arg("num_threads"));
 
-    module.def("rollout_backward", &bound_backward, py::arg("tape"), py::arg("position").noconvert(),
-               py::arg("orientation").noconvert(), py::arg("velocity").noconvert(),
-               py::arg("angular_velocity").noconvert(), py::arg("force").noconvert().none(true),
-               py::arg("torque").noconvert().none(true), py::arg("body_velocity").noconvert().none(true),
-               py::arg("body_angular_velocity").noconvert().none(true), py::arg("mass").noconvert(),
-               py::arg("inertia").noconvert(), py::arg("gravity").noconvert(), py::arg("grad_position").noconvert().none(true), py::arg("grad_orientation").noconvert().none(true),
-               py::arg("grad_velocity").noconvert().none(true),
-               py::arg("grad_angular_velocity").noconvert().none(true), py::arg("needs"), py::arg("num_threads"));
+    module.def(
+        "rollout_backward", &bound_backward, py::arg("tape"), py::arg("position").noconvert(),
+        py::arg("orientation").noconvert(), py::arg("velocity").noconvert(), py::arg("angular_velocity").noconvert(),
+        py::arg("force").noconvert().none(true), py::arg("torque").noconvert().none(true),
+        py::arg("body_velocity").noconvert().none(true), py::arg("body_angular_velocity").noconvert().none(true),
+        py::arg("mass").noconvert(), py::arg("inertia").noconvert(), py::arg("gravity").noconvert(),
+        py::arg("grad_position").noconvert().none(true), py::arg("grad_orientation").noconvert().none(true),
+        py::arg("grad_velocity").noconvert().none(true), py::arg("grad_angular_velocity").noconvert().none(true),
+        py::arg("needs"), py::arg("num_threads"));
 
-    module.def("separate", &bound_separate, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
-               py::arg("orientation").noconvert(), py::arg("mass").noconvert(), py::arg("inertia").noconvert(),
-               "Move dynamic bodies apart to their rest distance: (position, orientation, largest shift [m]).");
+    module.def(
+        "separate", &bound_separate, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
+        py::arg("orientation").noconvert(), py::arg("mass").noconvert(), py::arg("inertia").noconvert(),
+        "Move dynamic bodies apart to their rest distance: (position, orientation, largest shift [m]).");
 
-    module.def("min_distance", &bound_min_distance, py::arg("model"), py::arg("position").noconvert(),
-               py::arg("orientation").noconvert());
+    module.def(
+        "min_distance", &bound_min_distance, py::arg("model"), py::arg("position").noconvert(),
+        py::arg("orientation").noconvert());
 }
 
 }  // namespace diffsim::bindings

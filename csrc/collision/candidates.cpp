@@ -42,8 +42,9 @@ bool patch_counts(const Patch& own, const Patch& other, ContactType type) {
 }
 
 /// Vertices of one cell against the patch of the other.
-void pair_vertices(const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b, ContactType type,
-                   std::vector<FeaturePair>& pairs) {
+void pair_vertices(
+    const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b, ContactType type,
+    std::vector<FeaturePair>& pairs) {
     if (cell_a.vertices.empty()) return;
     if (!patch_counts(a.mesh->patches[cell_a.patch], b.mesh->patches[cell_b.patch], type)) return;
     const Box box_b = patch_box(b, cell_b.patch);
@@ -56,8 +57,8 @@ void pair_vertices(const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, c
     }
 }
 
-void pair_cells(const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b,
-                std::vector<FeaturePair>& pairs) {
+void pair_cells(
+    const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b, std::vector<FeaturePair>& pairs) {
     pair_vertices(a, cell_a, b, cell_b, ContactType::vertex_patch, pairs);
     pair_vertices(b, cell_b, a, cell_a, ContactType::patch_vertex, pairs);
     for (int ea : cell_a.edges) {
@@ -87,7 +88,9 @@ struct TreePairing {
         }
     }
 
-    static Box node_box(const SweptMesh& swept, int node) { return swept_box_of(swept.mesh->tree.nodes[node].box, swept); }
+    static Box node_box(const SweptMesh& swept, int node) {
+        return swept_box_of(swept.mesh->tree.nodes[node].box, swept);
+    }
 };
 
 }  // namespace

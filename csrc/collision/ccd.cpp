@@ -33,8 +33,8 @@ double advance(const Closest& closest, const ClosingSpeed& closing_speed, const 
 
 }  // namespace
 
-double vertex_polygon_toi(const Vec3& x0, const Vec3& x1, const Vec3* p0, const Vec3* p1, int count,
-                          const CcdOptions& options) {
+double vertex_polygon_toi(
+    const Vec3& x0, const Vec3& x1, const Vec3* p0, const Vec3* p1, int count, const CcdOptions& options) {
     std::array<Vec3, kSmallPolygon> small;
     std::vector<Vec3> large;
     if (count > kSmallPolygon) large.resize(static_cast<std::size_t>(count));
@@ -52,7 +52,8 @@ double vertex_polygon_toi(const Vec3& x0, const Vec3& x1, const Vec3* p0, const 
     return advance(closest, closing_speed, options);
 }
 
-double edge_edge_toi(const Vec3 a0[2], const Vec3 a1[2], const Vec3 b0[2], const Vec3 b1[2], const CcdOptions& options) {
+double edge_edge_toi(
+    const Vec3 a0[2], const Vec3 a1[2], const Vec3 b0[2], const Vec3 b1[2], const CcdOptions& options) {
     const Vec3 va[2] = {a1[0] - a0[0], a1[1] - a0[1]};
     const Vec3 vb[2] = {b1[0] - b0[0], b1[1] - b0[1]};
     const auto closest = [&](double s) {

@@ -20,8 +20,8 @@ inline constexpr double kNoImpact = kInfinity;
 
 /// A time in [0, 1] up to which the vertex, going from x0 to x1, stays at least min_distance away from the
 /// convex polygon going from p0 to p1, or kNoImpact if it does all the way. 0 where it starts too close.
-double vertex_polygon_toi(const Vec3& x0, const Vec3& x1, const Vec3* p0, const Vec3* p1, int count,
-                          const CcdOptions& options);
+double vertex_polygon_toi(
+    const Vec3& x0, const Vec3& x1, const Vec3* p0, const Vec3* p1, int count, const CcdOptions& options);
 
 /// The same for two segments, each given by its two ends at the start and at the end of the motion.
 double edge_edge_toi(const Vec3 a0[2], const Vec3 a1[2], const Vec3 b0[2], const Vec3 b1[2], const CcdOptions& options);

@@ -17,16 +17,17 @@ struct Rows {
 };
 
 /// Derivatives of an active contact; with the ground only the parts of body a are set.
-ContactDerivatives derivatives_of(const Zone& zone, const ZonePoint& point, const ActiveContact& active,
-                                  bool with_curvature) {
+ContactDerivatives derivatives_of(
+    const Zone& zone, const ZonePoint& point, const ActiveContact& active, bool with_curvature) {
     const ZoneContact& contact = zone.contacts[active.index];
     const Vec3& center_a = point.poses[contact.a].t;
     if (!contact.contact.with_ground())
-        return contact_derivatives(active.geometry, contact.range, contact.stiffness.value, center_a,
-                                   point.poses[contact.b].t, true, with_curvature);
-    const GroundDerivatives ground =
-        ground_derivatives(active.geometry.distance, active.geometry.closest.point_a - center_a, contact.range,
-                           contact.stiffness.value, with_curvature);
+        return contact_derivatives(
+            active.geometry, contact.range, contact.stiffness.value, center_a, point.poses[contact.b].t, true,
+            with_curvature);
+    const GroundDerivatives ground = ground_derivatives(
+        active.geometry.distance, active.geometry.closest.point_a - center_a, contact.range, contact.stiffness.value,
+        with_curvature);
     ContactDerivatives result;
     result.row.head<6>() = ground.row;
     result.gradient.head<6>() = -ground.force * ground.row;
@@ -104,14 +105,15 @@ Coordinates solve_qr(const Zone& zone, const Rows& rows, const Coordinates& upst
     correction.head(rank) = projected - gram.llt().solve(projected);
     v -= qr.householderQ() * correction;
     for (int i = 0; i < zone.dynamic_count; ++i)
-        factors[static_cast<std::size_t>(i)].triangularView<Eigen::Lower>().transpose().solveInPlace(v.segment<6>(6 * i));
+        factors[static_cast<std::size_t>(i)].triangularView<Eigen::Lower>().transpose().solveInPlace(
+            v.segment<6>(6 * i));
     return unflatten(v);
 }
 
 }  // namespace
 
-ZoneAdjoint zone_adjoint(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode,
-                         BlockSystem& system) {
+ZoneAdjoint zone_adjoint(
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, BlockSystem& system) {
     const bool exact = mode == AdjointMode::exact;
     ZoneAdjoint result;
     ZoneDerivatives derivatives;
@@ -153,8 +155,7 @@ ZoneAdjoint zone_adjoint(const Zone& zone, const ZonePoint& point, const Coordin
             result.pose_gradient[contact.b] -= gradient.tail<6>();
             along = d.gradient.dot(both);
         }
-        if (contact.a < zone.dynamic_count)
-            result.mass_gradient[contact.a] -= along * contact.stiffness.log_gradient_a;
+        if (contact.a < zone.dynamic_count) result.mass_gradient[contact.a] -= along * contact.stiffness.log_gradient_a;
         if (contact.b >= 0 && contact.b < zone.dynamic_count)
             result.mass_gradient[contact.b] -= along * contact.stiffness.log_gradient_b;
     }

@@ -21,7 +21,7 @@ struct ZoneAdjoint {
 };
 
 /// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution.
-ZoneAdjoint zone_adjoint(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode,
-                         BlockSystem& system);
+ZoneAdjoint zone_adjoint(
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, BlockSystem& system);
 
 }  // namespace diffsim

@@ -45,8 +45,8 @@ private:
     int m_body_count = 0;
     std::vector<std::pair<int, int>> m_pairs;
     std::vector<Mat6> m_diagonal, m_off_diagonal;
-    Mat6 m_single;         // Cholesky factor of one body
-    MatrixX m_dense;       // Cholesky factor of a few
+    Mat6 m_single;    // Cholesky factor of one body
+    MatrixX m_dense;  // Cholesky factor of a few
     std::unique_ptr<SparseFactor> m_sparse;
     bool m_pattern_changed = true;
 };

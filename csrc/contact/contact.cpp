@@ -40,11 +40,12 @@ ClosestPoints swapped(const ClosestPoints& points) {
 }
 
 /// A vertex of `mesh_v` against a patch of `mesh_p`.
-ClosestPoints vertex_against_patch(const CollisionMesh& mesh_v, int vertex, const Pose& pose_v,
-                                   const CollisionMesh& mesh_p, int patch, const Pose& pose_p) {
+ClosestPoints vertex_against_patch(
+    const CollisionMesh& mesh_v, int vertex, const Pose& pose_v, const CollisionMesh& mesh_p, int patch,
+    const Pose& pose_p) {
     const Corners corners(mesh_p, patch, pose_p);
-    return closest_vertex_polygon(pose_v * mesh_v.vertices[vertex],
-                                  {corners.data(), corners.count(), pose_p.R * mesh_p.patches[patch].normal});
+    return closest_vertex_polygon(
+        pose_v * mesh_v.vertices[vertex], {corners.data(), corners.count(), pose_p.R * mesh_p.patches[patch].normal});
 }
 
 /// ½ (r nᵀ + n rᵀ) - (n·r) I: second derivative of n · Exp(phi) r at phi = 0.
@@ -139,8 +140,8 @@ AngleDerivatives angle_derivatives(const Vec3& a, const Vec3& b) {
 
 }  // namespace
 
-ContactGeometry contact_geometry(const Model& model, const Contact& contact, const Pose& pose_a, const Pose& pose_b,
-                                 double ground_height) {
+ContactGeometry contact_geometry(
+    const Model& model, const Contact& contact, const Pose& pose_a, const Pose& pose_b, double ground_height) {
     ContactGeometry geometry;
     const CollisionMesh& mesh_a = model.bodies[contact.object_a].mesh;
     if (contact.with_ground()) {
@@ -154,7 +155,8 @@ ContactGeometry contact_geometry(const Model& model, const Contact& contact, con
     const CollisionMesh& mesh_b = model.bodies[contact.object_b].mesh;
     switch (contact.type) {
         case ContactType::vertex_patch:
-            geometry.closest = vertex_against_patch(mesh_a, contact.feature_a, pose_a, mesh_b, contact.feature_b, pose_b);
+            geometry.closest =
+                vertex_against_patch(mesh_a, contact.feature_a, pose_a, mesh_b, contact.feature_b, pose_b);
             break;
         case ContactType::patch_vertex:
             geometry.closest =
@@ -181,8 +183,9 @@ ContactGeometry contact_geometry(const Model& model, const Contact& contact, con
     return geometry;
 }
 
-double contact_toi(const Model& model, const Contact& contact, const Sweep& sweep_a, const Sweep& sweep_b,
-                   double ground_height, const CcdOptions& options) {
+double contact_toi(
+    const Model& model, const Contact& contact, const Sweep& sweep_a, const Sweep& sweep_b, double ground_height,
+    const CcdOptions& options) {
     const CollisionMesh& mesh_a = model.bodies[contact.object_a].mesh;
     if (contact.with_ground()) {
         const Vec3& x = mesh_a.vertices[contact.feature_a];
@@ -228,9 +231,9 @@ double contact_energy(const ContactGeometry& geometry, const ContactRange& range
     return geometry.sine_sq > 0.0 ? edge_mollifier(geometry.sine_sq).value * energy : 0.0;
 }
 
-ContactDerivatives contact_derivatives(const ContactGeometry& geometry, const ContactRange& range, double stiffness,
-                                       const Vec3& center_a, const Vec3& center_b, bool with_hessian,
-                                       bool with_curvature) {
+ContactDerivatives contact_derivatives(
+    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const Vec3& center_a,
+    const Vec3& center_b, bool with_hessian, bool with_curvature) {
     ContactDerivatives result;
     result.row = distance_gradient(geometry, center_a, center_b);
     const PotentialValue potential =
@@ -249,8 +252,9 @@ ContactDerivatives contact_derivatives(const ContactGeometry& geometry, const Co
     result.hessian = result.stiffness * (result.row * result.row.transpose());
     if (!with_curvature) return result;
     if (result.force != 0.0) {
-        result.hessian -= result.force * distance_hessian(geometry, geometry.closest.point_a - center_a,
-                                                          geometry.closest.point_b - center_b);
+        result.hessian -=
+            result.force *
+            distance_hessian(geometry, geometry.closest.point_a - center_a, geometry.closest.point_b - center_b);
     }
     if (mollified) {
         const Mat12 cross = result.row * angle.gradient.transpose();
@@ -261,8 +265,8 @@ ContactDerivatives contact_derivatives(const ContactGeometry& geometry, const Co
     return result;
 }
 
-GroundDerivatives ground_derivatives(double height, const Vec3& arm, const ContactRange& range, double stiffness,
-                                     bool with_curvature) {
+GroundDerivatives ground_derivatives(
+    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_curvature) {
     const PotentialValue potential = contact_potential(range.rest - height, range.rest - range.pole, stiffness);
     GroundDerivatives result;
     result.force = potential.force;

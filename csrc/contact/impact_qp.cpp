@@ -9,9 +9,9 @@ namespace {
 constexpr int kMaxRounds = 40;
 constexpr int kMaxNewtonSteps = 100;
 constexpr double kQpTolerance = 1e-9;  // of the starting gradient: a search direction needs no more
-constexpr double kMaxTurn = 0.5;      // [rad] in one direction: rows hold their meaning over that
+constexpr double kMaxTurn = 0.5;       // [rad] in one direction: rows hold their meaning over that
 constexpr int kMaxTurnLimits = 5;
-constexpr double kNearby = 2.0;  // pairs this many contact ranges away are rows from the start
+constexpr double kNearby = 2.0;        // pairs this many contact ranges away are rows from the start
 constexpr double kImpactWindow = 0.5;  // later impacts of two bodies count up to this part of the smaller radius
 
 double dot(const Coordinates& a, const Coordinates& b, int count) {
@@ -31,8 +31,9 @@ Vec6 mass_times(const ZoneBody& body, const Vec6& p) {
 }
 
 /// Minimise the convex piecewise quadratic t -> f(p + t s) for t > 0: Newton with bisection as its guard.
-double exact_line_search(const std::vector<double>& violation, const std::vector<double>& slope,
-                         const std::vector<ImpactRow>& rows, double first, double second) {
+double exact_line_search(
+    const std::vector<double>& violation, const std::vector<double>& slope, const std::vector<ImpactRow>& rows,
+    double first, double second) {
     double lower = 0.0, upper = kInfinity, t = 1.0;
     for (int k = 0; k < 60; ++k) {
         double derivative = first + t * second, curvature = second;
@@ -51,12 +52,12 @@ double exact_line_search(const std::vector<double>& violation, const std::vector
     return t;
 }
 
-ImpactRow make_row(const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry,
-                   const std::vector<Pose>& poses, const Coordinates& y) {
+ImpactRow make_row(
+    const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const std::vector<Pose>& poses,
+    const Coordinates& y) {
     const Vec3 no_center = Vec3::Zero();
     const bool ground = contact.contact.with_ground();
-    const Vec12 row =
-        distance_gradient(geometry, poses[contact.a].t, ground ? no_center : poses[contact.b].t);
+    const Vec12 row = distance_gradient(geometry, poses[contact.a].t, ground ? no_center : poses[contact.b].t);
     ImpactRow result;
     result.a = contact.a < zone.dynamic_count ? contact.a : -1;
     result.b = !ground && contact.b < zone.dynamic_count ? contact.b : -1;
@@ -69,8 +70,8 @@ ImpactRow make_row(const Zone& zone, const ZoneContact& contact, const ContactGe
 
 /// Between closed surfaces a first impact comes from outside: normals that point into a body belong to pairs hit after
 /// passing through another part of it.
-bool comes_from_outside(const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry,
-                        const std::vector<Pose>& poses) {
+bool comes_from_outside(
+    const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const std::vector<Pose>& poses) {
     if (contact.contact.with_ground()) return true;
     const auto outward = [&](int body, int feature, bool is_patch) -> Vec3 {
         const CollisionMesh& mesh = zone.mesh(body);
@@ -90,8 +91,9 @@ std::pair<int, int> objects(const ZoneContact& contact) { return {contact.a, con
 
 }  // namespace
 
-int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, const std::vector<double>& mass_factor,
-                    const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p) {
+int solve_impact_qp(
+    const Zone& zone, const Coordinates& inertial_gradient, const std::vector<double>& mass_factor,
+    const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p) {
     const int count = zone.dynamic_count;
     Coordinates gradient(static_cast<std::size_t>(count)), step(static_cast<std::size_t>(count));
     std::vector<double> violation(rows.size()), slope(rows.size());
@@ -144,8 +146,9 @@ int solve_impact_qp(const Zone& zone, const Coordinates& inertial_gradient, cons
 namespace {
 
 /// Solve the QP, and again with more mass for bodies that would turn too far.
-int solve_with_limited_turns(const Zone& zone, const Coordinates& inertial_gradient, std::vector<double>& mass_factor,
-                             const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p) {
+int solve_with_limited_turns(
+    const Zone& zone, const Coordinates& inertial_gradient, std::vector<double>& mass_factor,
+    const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p) {
     int newton_steps = 0;
     for (int k = 0; k < kMaxTurnLimits; ++k) {
         newton_steps += solve_impact_qp(zone, inertial_gradient, mass_factor, rows, system, p);
@@ -167,7 +170,8 @@ ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, Block
     const int count = zone.dynamic_count;
     const std::size_t total = static_cast<std::size_t>(zone.body_count());
     Coordinates inertial_gradient(static_cast<std::size_t>(count));
-    for (int i = 0; i < count; ++i) inertial_gradient[i] = mass_times(zone.bodies[i], point.y[i] - zone.bodies[i].target);
+    for (int i = 0; i < count; ++i)
+        inertial_gradient[i] = mass_times(zone.bodies[i], point.y[i] - zone.bodies[i].target);
 
     std::vector<ImpactRow> rows;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
@@ -227,8 +231,8 @@ ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, Block
             if (listed[impact.contact] && impact.toi > earliest) continue;
             // Relative travel between the first impact of these bodies and this one.
             const int b = ground ? contact.a : contact.b;
-            const double radius = std::max(std::min(zone.mesh(contact.a).radius, zone.mesh(b).radius),
-                                           zone.model->thickness);
+            const double radius =
+                std::max(std::min(zone.mesh(contact.a).radius, zone.mesh(b).radius), zone.model->thickness);
             Vec6 relative = y_end[contact.a] - point.y[contact.a];
             if (!ground) relative.tail<3>() -= (y_end[b] - point.y[b]).tail<3>();
             const double travel = (impact.toi - earliest) * relative.tail<3>().norm();
@@ -246,8 +250,8 @@ ImpactDirection impact_direction(const Zone& zone, const ZonePoint& point, Block
             // distance + row (p - p_impact) >= landing, p counted from the current point
             row.missing = contact.range.landing - geometry.distance;
             const auto account = [&](int body, const Vec6& r, bool yields) {
-                row.missing += yields ? r.dot(y_impact[body] - point.y[body])
-                                      : -r.dot(zone.bodies[body].target - y_impact[body]);
+                row.missing +=
+                    yields ? r.dot(y_impact[body] - point.y[body]) : -r.dot(zone.bodies[body].target - y_impact[body]);
             };
             account(contact.a, row.row_a, row.a >= 0);
             if (!ground) account(contact.b, row.row_b, row.b >= 0);

@@ -18,9 +18,9 @@ PotentialValue contact_potential(double compression, double pole, double stiffne
         constexpr double infinity = std::numeric_limits<double>::infinity();
         return {infinity, infinity, infinity};
     }
-    return {0.5 * stiffness * compression * compression / rest,
-            stiffness * compression * (1.0 - 0.5 * compression / pole) / (rest * rest),
-            stiffness / (rest * rest * rest)};
+    return {
+        0.5 * stiffness * compression * compression / rest,
+        stiffness * compression * (1.0 - 0.5 * compression / pole) / (rest * rest), stiffness / (rest * rest * rest)};
 }
 
 Mollifier edge_mollifier(double sine_sq) {
@@ -46,7 +46,16 @@ ContactStiffness contact_stiffness(double mass_a, double mass_b, double complian
 
 ContactRange contact_range(double margin_sum, double thickness) {
     const double depth = std::min(margin_sum, thickness);
-    return {margin_sum, margin_sum - 0.1 * depth, margin_sum - 0.9 * depth, margin_sum - 0.95 * depth};
+    return {
+        margin_sum, margin_sum - 0.1 * depth, margin_sum - 0.9 * depth, margin_sum - 0.95 * depth, margin_sum - depth};
+}
+
+ContactRange rescued_range(const ContactRange& range, double start_distance) {
+    if (start_distance >= range.pole + 0.1 * (range.floor - range.pole)) return range;
+    ContactRange rescued = range;
+    rescued.pole = range.limit + 0.5 * (start_distance - range.limit);
+    rescued.floor = range.limit + 0.75 * (start_distance - range.limit);
+    return rescued;
 }
 
 }  // namespace diffsim

@@ -39,7 +39,12 @@ struct ContactRange {
     double landing;  ///< what a linearised impact aims at: inside the contact's reach, far from its pole [m]
     double floor;    ///< motions are stopped here [m]
     double pole;     ///< the energy is infinite here [m]
+    double limit;    ///< objects this near penetrate [m]
 };
 ContactRange contact_range(double margin_sum, double thickness);
+
+/// The range of a contact that starts its step at this distance. A step that did not converge may leave objects next to
+/// their pole; theirs moves half way towards the limit, so that the next step can push them out.
+ContactRange rescued_range(const ContactRange& range, double start_distance);
 
 }  // namespace diffsim

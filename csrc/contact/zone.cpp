@@ -32,15 +32,15 @@ public:
         const Vec3& center_a = point.poses[contact.a].t;
         const double stiffness = contact.stiffness.value;
         if (contact.contact.with_ground()) {
-            const GroundDerivatives d =
-                ground_derivatives(active.geometry.distance, active.geometry.closest.point_a - center_a, contact.range,
-                                   stiffness, m_curvature != Curvature::dropped);
+            const GroundDerivatives d = ground_derivatives(
+                active.geometry.distance, active.geometry.closest.point_a - center_a, contact.range, stiffness,
+                m_curvature != Curvature::dropped);
             add_body(contact.a, d.row, -d.force * d.row, d.force, d.stiffness, d.hessian);
             return;
         }
-        const ContactDerivatives d =
-            contact_derivatives(active.geometry, contact.range, stiffness, center_a, point.poses[contact.b].t,
-                                m_system != nullptr, m_curvature != Curvature::dropped);
+        const ContactDerivatives d = contact_derivatives(
+            active.geometry, contact.range, stiffness, center_a, point.poses[contact.b].t, m_system != nullptr,
+            m_curvature != Curvature::dropped);
         const bool yields_a = contact.a < m_zone.dynamic_count, yields_b = contact.b < m_zone.dynamic_count;
         if (yields_a && yields_b && m_curvature == Curvature::projected) {
             const Mat12 hessian = positive_part<12>(d.hessian);
@@ -50,11 +50,13 @@ public:
         if (yields_a && yields_b) {
             add_pair(contact, d, d.hessian);
         } else if (yields_a) {
-            add_body(contact.a, d.row.head<6>(), d.gradient.head<6>(), d.force, d.stiffness,
-                     d.hessian.topLeftCorner<6, 6>());
+            add_body(
+                contact.a, d.row.head<6>(), d.gradient.head<6>(), d.force, d.stiffness,
+                d.hessian.topLeftCorner<6, 6>());
         } else {
-            add_body(contact.b, d.row.tail<6>(), d.gradient.tail<6>(), d.force, d.stiffness,
-                     d.hessian.bottomRightCorner<6, 6>());
+            add_body(
+                contact.b, d.row.tail<6>(), d.gradient.tail<6>(), d.force, d.stiffness,
+                d.hessian.bottomRightCorner<6, 6>());
         }
     }
 
@@ -66,8 +68,8 @@ private:
         m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, stiffness * scale);
     }
 
-    void add_body(int body, const Vec6& row, const Vec6& gradient, double force, double stiffness,
-                  const Mat6& hessian) {
+    void add_body(
+        int body, const Vec6& row, const Vec6& gradient, double force, double stiffness, const Mat6& hessian) {
         add_gradient(body, row, gradient, force, stiffness);
         if (m_system == nullptr) return;
         m_system->diagonal(body) += m_curvature == Curvature::projected ? positive_part<6>(hessian) : hessian;
@@ -98,6 +100,16 @@ Pose pose_at(const ZoneBody& body, const Vec6& y) {
     return {exp_rotation(y.head<3>()) * body.start.R, body.start.t + y.tail<3>()};
 }
 
+void rescue_contacts(Zone& zone) {
+    for (ZoneContact& contact : zone.contacts) {
+        const Pose& pose_a = zone.bodies[contact.a].start;
+        const Pose& pose_b = contact.contact.with_ground() ? pose_a : zone.bodies[contact.b].start;
+        const double distance =
+            contact_geometry(*zone.model, contact.contact, pose_a, pose_b, zone.ground_height).distance;
+        contact.range = rescued_range(contact.range, distance);
+    }
+}
+
 Mat6 chart_jacobian(const Vec6& y) {
     Mat6 jacobian = Mat6::Identity();
     jacobian.topLeftCorner<3, 3>() = left_jacobian(y.head<3>());
@@ -121,7 +133,8 @@ void evaluate(const Zone& zone, ZonePoint& point) {
         point.poses[i] = pose_at(body, point.y[i]);
         if (i >= zone.dynamic_count) continue;
         const Vec6 error = point.y[i] - body.target;
-        inertial += 0.5 * (error.head<3>().dot(body.inertia * error.head<3>()) + body.mass * error.tail<3>().squaredNorm());
+        inertial +=
+            0.5 * (error.head<3>().dot(body.inertia * error.head<3>()) + body.mass * error.tail<3>().squaredNorm());
     }
     point.distances.resize(zone.contacts.size());
     point.active.clear();
@@ -148,8 +161,8 @@ void evaluate(const Zone& zone, ZonePoint& point) {
     point.energy = inertial + point.contact_energy;
 }
 
-void differentiate(const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives,
-                   BlockSystem* system) {
+void differentiate(
+    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system) {
     const int count = zone.dynamic_count;
     derivatives.gradient.assign(static_cast<std::size_t>(count), Vec6::Zero());
     derivatives.torque.resize(static_cast<std::size_t>(count));

@@ -16,13 +16,13 @@ namespace diffsim {
 using Coordinates = std::vector<Vec6>;  ///< one (theta, u) per body of a zone
 
 struct ZoneBody {
-    int id = 0;                     ///< index into Model::bodies
-    Pose start;                     ///< at the start of the step, zone frame
-    Mat3 inertia = Mat3::Zero();    ///< R0 I_b R0ᵀ; dynamic bodies only
+    int id = 0;                   ///< index into Model::bodies
+    Pose start;                   ///< at the start of the step, zone frame
+    Mat3 inertia = Mat3::Zero();  ///< R0 I_b R0ᵀ; dynamic bodies only
     Mat3 inverse_inertia = Mat3::Zero();
-    double mass = kInfinity;        ///< infinite for bodies that do not yield
-    Vec6 target = Vec6::Zero();     ///< ŷ: where a dynamic body goes when nothing touches it, a kinematic one is driven
-    Vec6 warm = Vec6::Zero();       ///< last step's motion: dt (w0, v0)
+    double mass = kInfinity;     ///< infinite for bodies that do not yield
+    Vec6 target = Vec6::Zero();  ///< ŷ: where a dynamic body goes when nothing touches it, a kinematic one is driven
+    Vec6 warm = Vec6::Zero();    ///< last step's motion: dt (w0, v0)
 };
 
 /// A body that other bodies cannot move, in the world frame.
@@ -64,6 +64,9 @@ struct Zone {
 /// Pose of a body at its coordinates.
 Pose pose_at(const ZoneBody& body, const Vec6& y);
 
+/// Widen the range of contacts whose objects start the step next to their pole; see rescued_range.
+void rescue_contacts(Zone& zone);
+
 /// A contact below its rest distance.
 struct ActiveContact {
     int index;  ///< into Zone::contacts
@@ -98,8 +101,8 @@ struct ZoneDerivatives {
 };
 
 /// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's pattern.
-void differentiate(const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives,
-                   BlockSystem* system);
+void differentiate(
+    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system);
 
 /// d(twist)/dy of a body at theta: turns by the left Jacobian, shifts unchanged.
 Mat6 chart_jacobian(const Vec6& y);

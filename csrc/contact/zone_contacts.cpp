@@ -21,12 +21,14 @@ double sagitta(const Vec6& change, double radius) {
 
 SweptMesh swept_mesh(const Zone& zone, int body, const Coordinates& begin, const Coordinates& end, double slack) {
     const ZoneBody& b = zone.bodies[body];
-    return {&zone.mesh(body), {pose_at(b, begin[body]), pose_at(b, end[body])}, zone.model->bodies[b.id].margin + slack};
+    return {
+        &zone.mesh(body), {pose_at(b, begin[body]), pose_at(b, end[body])}, zone.model->bodies[b.id].margin + slack};
 }
 
 /// Let bodies that do not yield join the zone where its moving bodies come near them.
-void join_passive(Zone& zone, const PassiveBodies& passive, const std::vector<Box>& dynamic_boxes, Coordinates& begin,
-                  Coordinates& end) {
+void join_passive(
+    Zone& zone, const PassiveBodies& passive, const std::vector<Box>& dynamic_boxes, Coordinates& begin,
+    Coordinates& end) {
     if (passive.bodies.empty()) return;
     std::vector<int> near;
     for (Box box : dynamic_boxes) {
@@ -152,8 +154,9 @@ double allowed_step(const Zone& zone, const ZonePoint& point, const Coordinates&
         ccd.min_distance = contact.range.pole + keep;
         ccd.tolerance = 0.2 * keep;
         if (motion[contact.a] + (ground ? 0.0 : motion[contact.b]) < room - 1.2 * keep) continue;
-        const double toi = contact_toi(*zone.model, contact.contact, sweeps[contact.a],
-                                       ground ? kNoSweep : sweeps[contact.b], zone.ground_height, ccd);
+        const double toi = contact_toi(
+            *zone.model, contact.contact, sweeps[contact.a], ground ? kNoSweep : sweeps[contact.b], zone.ground_height,
+            ccd);
         if (toi == kNoImpact) continue;
         step = std::min(step, toi);
         if (impacts != nullptr) impacts->push_back({static_cast<int>(k), toi});

@@ -10,13 +10,18 @@ constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
 constexpr int kMaxStalls = 3;              // steps in a row that get a driven body nowhere
 constexpr double kStall = 1e-3;            // of the way that is left
+constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
+constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
+constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
 class ZoneSolver {
 public:
-    ZoneSolver(Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-               std::vector<Box>& visited)
+    ZoneSolver(
+        Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+        std::vector<Box>& visited)
         : m_zone(zone), m_passive(passive), m_options(options), m_w(workspace), m_visited(visited) {}
 
     ZoneResult solve() {
@@ -41,10 +46,16 @@ private:
         list_contacts(m_w.y_end);
         evaluate(m_zone, m_w.point);
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-            if (m_w.point.distances[k] > m_zone.contacts[k].range.pole) continue;
+            const ContactRange& range = m_zone.contacts[k].range;
+            m_rescue = m_rescue || m_w.point.distances[k] < range.floor;
+            if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
             m_result.status = ZoneStatus::bad_start;
             m_result.worst_contact = static_cast<int>(k);
             return;
+        }
+        if (m_rescue) {
+            rescue_contacts(m_zone);
+            evaluate(m_zone, m_w.point);
         }
         m_visited.assign(count, Box());
         mark_visited();
@@ -53,6 +64,13 @@ private:
     /// List contacts for the way from the current point to y_end.
     void list_contacts(Coordinates& y_end) {
         m_coverage = collect_contacts(m_zone, m_passive, y(), y_end);
+        if (m_rescue) rescue_contacts(m_zone);
+        m_position = m_zone.model->thickness;
+        if (m_zone.model->ground.present) m_position = std::max(m_position, std::abs(m_zone.ground_height));
+        for (int i = 0; i < m_zone.body_count(); ++i) {
+            const ZoneBody& body = m_zone.bodies[i];
+            m_position = std::max(m_position, body.start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
+        }
         m_w.system.set_pattern(m_zone.dynamic_count, m_zone.pairs);
     }
 
@@ -86,6 +104,7 @@ private:
     void go_to_warm_start() {
         m_w.y_end = y();
         for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end[i] = m_zone.bodies[i].warm;
+        if (largest_move() < kEpsilon * m_position) return;
         ensure_covered(m_w.y_end);
         const double step = clear_step(m_w.y_end);
         if (step > 0.0) accept_trial();
@@ -116,7 +135,8 @@ private:
     }
 
     void set_trial(const Coordinates& y_end, double step) {
-        for (std::size_t i = 0; i < m_w.trial.y.size(); ++i) m_w.trial.y[i] = y()[i] + step * (y_end[i] - y()[i]);
+        m_w.trial.y.resize(y_end.size());
+        for (std::size_t i = 0; i < y_end.size(); ++i) m_w.trial.y[i] = y()[i] + step * (y_end[i] - y()[i]);
     }
 
     bool drives_done() const {
@@ -133,18 +153,15 @@ private:
     };
 
     Accuracy accuracy() const {
-        double residual = 0.0, reference = m_w.derivatives.largest_force, position = m_zone.model->thickness;
-        double lightest = kInfinity;
+        double residual = 0.0, reference = m_w.derivatives.largest_force;
         for (int i = 0; i < m_zone.dynamic_count; ++i) {
             const ZoneBody& body = m_zone.bodies[i];
             const Vec6& g = m_w.derivatives.gradient[i];
             residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
             reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
-            position = std::max(position, body.start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
-            lightest = std::min(lightest, body.mass);
         }
         if (!(reference > 0.0)) return {0.0, 0.0};
-        return {residual / reference, kEpsilon * position * m_w.derivatives.largest_stiffness / reference};
+        return {residual / reference, kEpsilon * m_position * m_w.derivatives.largest_stiffness / reference};
     }
 
     static double scaled(const Mat3& turn_metric, double shift_metric, const Vec6& v) {
@@ -188,9 +205,6 @@ private:
 
     /// What rounding can do to the energy.
     double energy_noise() const {
-        double position = 0.0;
-        for (int i = 0; i < m_zone.dynamic_count; ++i)
-            position = std::max(position, m_zone.bodies[i].start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
         double force_sum = 0.0;
         for (const ActiveContact& active : m_w.point.active) {
             const ZoneContact& contact = m_zone.contacts[active.index];
@@ -198,7 +212,7 @@ private:
             force_sum +=
                 contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
         }
-        return 1e-15 * std::abs(m_w.point.energy) + 8.0 * kEpsilon * position * force_sum;
+        return 1e-15 * std::abs(m_w.point.energy) + 8.0 * kEpsilon * m_position * force_sum;
     }
 
     /// Backtrack along the way to y_end until the energy falls. At rest its fall drowns in rounding: there the slope
@@ -227,39 +241,49 @@ private:
 
     void iterate() {
         int stalls = 0;
+        int relaxations = 0;  // Newton steps to be taken before driven bodies go on
+        double best_residual = kInfinity;
+        int stagnant = 0;  // steps since the residual last halved
         for (m_result.iterations = 0;; ++m_result.iterations) {
             const bool driven = drives_done();
             if (!newton_step()) return fail(ZoneStatus::no_descent);
-            Accuracy now = accuracy();
+            const Accuracy now = accuracy();
             m_result.residual = now.residual;
             m_w.y_end = y();
             for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end[i] += m_w.step[i];
-            const double rounding_step = 16.0 * kEpsilon * position_scale();
+            const double rounding_step = 16.0 * kEpsilon * m_position;
             if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
                 polish();
                 return;
             }
+            const double good = kGoodEnough * std::max(m_options.tolerance, now.floor);
+            stagnant = now.residual < 0.5 * best_residual ? 0 : stagnant + 1;
+            best_residual = std::min(best_residual, now.residual);
+            if (driven && stagnant >= kStagnantSteps && now.residual < good) return;
             if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
 
+            if (!driven && relaxations == 0) {
+                const double step = past_impacts(0.0, false);
+                if (!advance_drives(step, stalls)) return fail(ZoneStatus::blocked);
+                if (step < 1.0) relaxations = kRelaxations;
+                accept_trial();
+                continue;
+            }
+            relaxations = now.residual < kRelaxed ? 0 : std::max(relaxations - 1, 0);
             // The step's end may lie where contacts have not been listed yet. New ones are beyond their rest distance
             // here, so energy and derivatives stand.
-            if (driven) ensure_covered(m_w.y_end);
-            double step = driven ? allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) : 0.0;
-            if (step < kClampedStep) step = past_impacts(step, driven);
-            if (step == 1.0) step = arc_step(1.0);
-            if (driven ? !line_search(step) : !advance_drives(step, stalls)) {
-                if (driven && now.residual < 1e3 * std::max(m_options.tolerance, now.floor)) return;
-                return fail(driven ? ZoneStatus::no_descent : ZoneStatus::blocked);
+            ensure_covered(m_w.y_end);
+            double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
+            step = driven && step < kClampedStep ? past_impacts(step, true) : arc_step(step);
+            if (line_search(step)) {
+                accept_trial();
+            } else if (!driven) {
+                relaxations = 0;
+            } else {
+                if (now.residual >= good) fail(ZoneStatus::no_descent);
+                return;
             }
-            accept_trial();
         }
-    }
-
-    double position_scale() const {
-        double position = m_zone.model->thickness;
-        for (int i = 0; i < m_zone.dynamic_count; ++i)
-            position = std::max(position, m_zone.bodies[i].start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
-        return position;
     }
 
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
@@ -328,13 +352,16 @@ private:
     ZoneWorkspace& m_w;
     std::vector<Box>& m_visited;
     ContactCoverage m_coverage;
+    double m_position = 0.0;  // size of the numbers that distances are differences of [m]
+    bool m_rescue = false;    // some objects start the step below their floor
     ZoneResult m_result;
 };
 
 }  // namespace
 
-ZoneResult solve_zone(Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-                      std::vector<Box>& visited) {
+ZoneResult solve_zone(
+    Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+    std::vector<Box>& visited) {
     return ZoneSolver(zone, passive, options, workspace, visited).solve();
 }
 

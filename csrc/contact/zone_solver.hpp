@@ -7,9 +7,9 @@ namespace diffsim {
 enum class ZoneStatus {
     converged,
     too_many_iterations,
-    no_descent,    ///< the line search found no lower energy
-    blocked,       ///< a driven body cannot reach its target: something is squeezed
-    bad_start,     ///< objects at or below their pole at the start of the step
+    no_descent,  ///< the line search found no lower energy
+    blocked,     ///< a driven body cannot reach its target: something is squeezed
+    bad_start,   ///< objects at or below their pole at the start of the step
 };
 
 struct ZoneOptions {
@@ -19,8 +19,8 @@ struct ZoneOptions {
 
 struct ZoneResult {
     ZoneStatus status = ZoneStatus::converged;
-    int iterations = 0;     ///< Newton steps
-    double residual = 0.0;  ///< largest |L⁻¹ g| of a body, M = L Lᵀ, relative to the largest contact force
+    int iterations = 0;      ///< Newton steps
+    double residual = 0.0;   ///< largest |L⁻¹ g| of a body, M = L Lᵀ, relative to the largest contact force
     int worst_contact = -1;  ///< for bad_start and blocked: index into Zone::contacts, or -1
 };
 
@@ -37,7 +37,8 @@ struct ZoneWorkspace {
 /// warm-started and stopped by CCD as docs/contact.md describes. On return workspace.point is the last iterate: the
 /// minimiser, or if the status says so the last penetration-free point before failure. `visited`, one box per dynamic
 /// body, receives the space swept by the bodies' vertices in the zone frame.
-ZoneResult solve_zone(Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-                      std::vector<Box>& visited);
+ZoneResult solve_zone(
+    Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+    std::vector<Box>& visited);
 
 }  // namespace diffsim

@@ -34,7 +34,7 @@ Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, c
     Substep best;
     double best_residual = kInfinity;
     Vec3 w = guess;
-    const double scale = momentum.norm();
+    const double scale = std::max(momentum.norm(), inertia_body.norm() * guess.norm());  // of the numbers subtracted
     for (int k = 0; k < kMaxNewtonSteps; ++k) {
         Substep trial;
         trial.angular_velocity = w;
@@ -45,7 +45,7 @@ Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, c
         if (!(norm < best_residual)) break;
         best = trial;
         best_residual = norm;
-        if (norm <= 0.5 * kEpsilon * scale) break;
+        if (norm <= 0.5 * kEpsilon * momentum.norm()) break;
         w -= momentum_jacobian(trial, dt).partialPivLu().solve(residual);
     }
     best.converged = best_residual <= 16.0 * kEpsilon * scale && dt * best.angular_velocity.norm() < 3.0;
@@ -53,8 +53,8 @@ Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, c
 }
 
 /// The whole step in a given number of substeps; empty if one of them did not converge.
-std::vector<Substep> solve_substeps(const Mat3& R0, const Vec3& guess, const Vec3& momentum, const Mat3& inertia_body,
-                                    double dt, int count) {
+std::vector<Substep> solve_substeps(
+    const Mat3& R0, const Vec3& guess, const Vec3& momentum, const Mat3& inertia_body, double dt, int count) {
     std::vector<Substep> substeps;
     substeps.reserve(static_cast<std::size_t>(count));
     Mat3 R = R0;
@@ -75,8 +75,8 @@ Vec3 initial_guess(const Mat3& inertia_world, const Vec3& angular_velocity, cons
 
 }  // namespace
 
-FreeRotation free_rotation(const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body,
-                           double dt) {
+FreeRotation free_rotation(
+    const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt) {
     if (angular_velocity.isZero(0.0) && torque.isZero(0.0)) return {Vec3::Zero(), Vec3::Zero(), 1};
     const Mat3 inertia_world = R0 * inertia_body * R0.transpose();
     const Vec3 momentum = inertia_world * angular_velocity + dt * torque;
@@ -105,9 +105,9 @@ Mat3 inertia_body_gradient(const Mat3& R, const Vec3& w, const Vec3& covector) {
     return 0.5 * (outer + outer.transpose());
 }
 
-FreeRotationGradient free_rotation_backward(const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque,
-                                            const Mat3& inertia_body, double dt, const FreeRotation& result,
-                                            const Vec3& grad_angular_velocity, const Vec3& grad_rotation) {
+FreeRotationGradient free_rotation_backward(
+    const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt,
+    const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation) {
     FreeRotationGradient grad;
     const Mat3 inertia0 = R0 * inertia_body * R0.transpose();
     const Vec3 momentum = inertia0 * angular_velocity + dt * torque;

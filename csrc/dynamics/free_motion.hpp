@@ -15,8 +15,8 @@ struct FreeRotation {
 /// momentum in free flight is kept to rounding. Where dt |w| exceeds one radian, where the equation
 /// need not have one solution, the step is cut into equal substeps, the torque's impulse given at the
 /// start; the rotation is then the logarithm of the product, shorter than half a turn.
-FreeRotation free_rotation(const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body,
-                           double dt);
+FreeRotation free_rotation(
+    const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt);
 
 struct FreeRotationGradient {
     Vec3 orientation = Vec3::Zero();  ///< rotation covector of R0
@@ -26,9 +26,9 @@ struct FreeRotationGradient {
 };
 
 /// Gradient of a loss with gradients grad_angular_velocity and grad_rotation at the result.
-FreeRotationGradient free_rotation_backward(const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque,
-                                            const Mat3& inertia_body, double dt, const FreeRotation& result,
-                                            const Vec3& grad_angular_velocity, const Vec3& grad_rotation);
+FreeRotationGradient free_rotation_backward(
+    const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt,
+    const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation);
 
 /// Rotation covector, at R, of covector · (R I_b Rᵀ w) with covector, w and I_b held fixed:
 /// d(I w) = phi x (I w) - I (phi x w).

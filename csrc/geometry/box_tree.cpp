@@ -58,7 +58,8 @@ void collect_overlaps(const BoxTree& tree, int a, int b, std::vector<std::pair<i
     if (!na.box.overlaps(nb.box)) return;
     if (na.is_leaf() && nb.is_leaf()) {
         pairs.emplace_back(std::min(na.item, nb.item), std::max(na.item, nb.item));
-    } else if (nb.is_leaf() || (!na.is_leaf() && (na.box.upper - na.box.lower).sum() >= (nb.box.upper - nb.box.lower).sum())) {
+    } else if (
+        nb.is_leaf() || (!na.is_leaf() && (na.box.upper - na.box.lower).sum() >= (nb.box.upper - nb.box.lower).sum())) {
         collect_overlaps(tree, na.left, b, pairs);
         collect_overlaps(tree, na.right, b, pairs);
     } else {

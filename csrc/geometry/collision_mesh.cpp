@@ -30,9 +30,13 @@ EdgeFaces collect_edge_faces(const std::vector<Triangle>& triangles) {
 /// Grows convex coplanar patches over the faces of one mesh.
 class PatchBuilder {
 public:
-    PatchBuilder(const std::vector<Vec3>& vertices, const std::vector<Triangle>& triangles, const EdgeFaces& edge_faces,
-                 double size)
-        : m_vertices(vertices), m_triangles(triangles), m_edge_faces(edge_faces), m_tolerance(kCoplanarTolerance * size) {
+    PatchBuilder(
+        const std::vector<Vec3>& vertices, const std::vector<Triangle>& triangles, const EdgeFaces& edge_faces,
+        double size)
+        : m_vertices(vertices),
+          m_triangles(triangles),
+          m_edge_faces(edge_faces),
+          m_tolerance(kCoplanarTolerance * size) {
         for (const Triangle& f : triangles)
             m_normals.push_back((vertices[f[1]] - vertices[f[0]]).cross(vertices[f[2]] - vertices[f[0]]).normalized());
     }

@@ -21,8 +21,7 @@ std::uint32_t parameter_code(double parameter) { return parameter <= 0.0 ? 0u : 
 
 Vec3 polygon_normal(const Vec3* vertices, int count) {
     Vec3 area = Vec3::Zero();
-    for (int k = 1; k + 1 < count; ++k)
-        area += (vertices[k] - vertices[0]).cross(vertices[k + 1] - vertices[0]);
+    for (int k = 1; k + 1 < count; ++k) area += (vertices[k] - vertices[0]).cross(vertices[k + 1] - vertices[0]);
     const double norm = area.norm();
     return norm > 0.0 ? Vec3(area / norm) : Vec3(Vec3::Zero());
 }
@@ -82,7 +81,8 @@ ClosestPoints closest_edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, 
     if (determinant > 0.0) {
         const double pa = da.dot(offset), pb = db.dot(offset);
         const double s = (ab * pb - bb * pa) / determinant;
-        const double t = (aa * pb - ab * pa) / determinant;
+        // Between nearly parallel edges s carries much rounding; the t that belongs to it makes that harmless.
+        const double t = (pb + s * ab) / bb;
         if (is_interior(s) && is_interior(t)) consider(s, t);
     }
     // Where a stationary point is well determined, it is the answer.

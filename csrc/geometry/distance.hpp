@@ -12,9 +12,9 @@ namespace diffsim {
 /// The closest points of features a and b, and along which directions each may slide on its feature.
 struct ClosestPoints {
     Vec3 point_a, point_b;
-    int slide_count_a = 0;           ///< 0 at a vertex, 1 on an edge, 2 inside a face
+    int slide_count_a = 0;  ///< 0 at a vertex, 1 on an edge, 2 inside a face
     int slide_count_b = 0;
-    std::array<Vec3, 2> slide_a;     ///< orthonormal directions, the first slide_count_a of them
+    std::array<Vec3, 2> slide_a;  ///< orthonormal directions, the first slide_count_a of them
     std::array<Vec3, 2> slide_b;
     std::uint32_t feature_code = 0;  ///< tells the type and the sub-features apart, for signatures
 

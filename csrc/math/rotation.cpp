@@ -20,9 +20,10 @@ struct AngleFunctions {
 AngleFunctions angle_functions(double angle_sq) {
     if (angle_sq < kSeriesAngleSq) {
         const double s = angle_sq;
-        return {1.0 - s / 6.0 * (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0 * (1.0 - s / 110.0)))),
-                0.5 * (1.0 - s / 12.0 * (1.0 - s / 30.0 * (1.0 - s / 56.0 * (1.0 - s / 90.0 * (1.0 - s / 132.0))))),
-                (1.0 - s / 20.0 * (1.0 - s / 42.0 * (1.0 - s / 72.0 * (1.0 - s / 110.0 * (1.0 - s / 156.0))))) / 6.0};
+        return {
+            1.0 + s * (-1.0 / 6 + s * (1.0 / 120 + s * (-1.0 / 5040 + s * (1.0 / 362880 - s / 39916800)))),
+            0.5 + s * (-1.0 / 24 + s * (1.0 / 720 + s * (-1.0 / 40320 + s * (1.0 / 3628800 - s / 479001600)))),
+            1.0 / 6 + s * (-1.0 / 120 + s * (1.0 / 5040 + s * (-1.0 / 362880 + s / 39916800)))};
     }
     const double angle = std::sqrt(angle_sq);
     const double sine = std::sin(angle);
@@ -67,7 +68,8 @@ Mat3 left_jacobian_transposed_derivative(const Vec3& theta, const Vec3& tau) {
     double db;  // (db/dangle) / angle
     double dc;  // (dc/dangle) / angle
     if (s < kSeriesAngleSq) {
-        db = -1.0 / 12.0 * (1.0 - s / 15.0 * (1.0 - 3.0 * s / 112.0 * (1.0 - 2.0 * s / 135.0 * (1.0 - 5.0 * s / 528.0))));
+        db = -1.0 / 12.0 *
+             (1.0 - s / 15.0 * (1.0 - 3.0 * s / 112.0 * (1.0 - 2.0 * s / 135.0 * (1.0 - 5.0 * s / 528.0))));
         dc = -1.0 / 60.0 * (1.0 - s / 21.0 * (1.0 - s / 48.0 * (1.0 - 2.0 * s / 165.0 * (1.0 - 5.0 * s / 624.0))));
     } else {
         // a = sin/t, so db = (a - 2 b) / t^2 and dc = (b - 3 c) / t^2.

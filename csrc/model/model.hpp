@@ -54,8 +54,8 @@ struct Options {
 
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.
 struct Parameters {
-    std::vector<double> mass;   ///< [kg]
-    std::vector<Mat3> inertia;  ///< body frame, symmetric [kg·m²]
+    std::vector<double> mass;     ///< [kg]
+    std::vector<Mat3> inertia;    ///< body frame, symmetric [kg·m²]
     Vec3 gravity = Vec3::Zero();  ///< [m/s²]
 };
 

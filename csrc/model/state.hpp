@@ -8,10 +8,10 @@ namespace diffsim {
 
 /// One rigid body: the pose of its centre of mass and its velocities, in the world frame.
 struct BodyState {
-    Vec3 position = Vec3::Zero();               ///< [m]
-    Vec4 orientation = Vec4(1, 0, 0, 0);        ///< unit quaternion w, x, y, z: body to world
-    Vec3 velocity = Vec3::Zero();               ///< [m/s]
-    Vec3 angular_velocity = Vec3::Zero();       ///< [rad/s]
+    Vec3 position = Vec3::Zero();          ///< [m]
+    Vec4 orientation = Vec4(1, 0, 0, 0);   ///< unit quaternion w, x, y, z: body to world
+    Vec3 velocity = Vec3::Zero();          ///< [m/s]
+    Vec3 angular_velocity = Vec3::Zero();  ///< [rad/s]
 };
 
 using SceneState = std::vector<BodyState>;
