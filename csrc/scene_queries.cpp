@@ -11,7 +11,7 @@ SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state) {
     Zone zone;
     zone.model = &model;
-    zone.compliance = options.compliance;
+    set_compliance(zone, options.compliance);
     zone.ground_height = model.ground.height;
     PassiveBodies passive;
     std::vector<Box> boxes;

@@ -81,10 +81,12 @@ struct StepWorkspace::ForwardScratch {
     std::vector<int> members, member_end;  ///< dynamic bodies sorted by group; where each group ends, by smallest body
     std::vector<Box> boxes, zone_visited;
     std::vector<Contact> contacts;              ///< active, group after group
+    std::vector<double> shifts;  ///< of their rest distances
     std::vector<std::pair<int, Vec6>> blocked;  ///< kinematic bodies that did not reach their targets: where they are
     std::vector<int> near;
     std::vector<int> zone_bodies, zone_body_end, zone_contact_end;  ///< as in StepRecord
     std::vector<Contact> zone_contacts;
+    std::vector<double> zone_shifts;
 };
 
 namespace {
@@ -179,6 +181,7 @@ private:
         m.outcomes.assign(count, GroupOutcome{});
         m.dirty.assign(count, 1);
         m.contacts.clear();
+        m.shifts.clear();
         m.boxes.clear();
         for (int i : m.dynamic) {
             const ZoneBody& moving = m.bodies[i];
@@ -237,7 +240,7 @@ private:
         }
         Zone& zone = m_workspace.zone_problem;
         zone.model = &m_model;
-        zone.compliance = m_options.compliance;
+        set_compliance(zone, m_options.compliance);
         zone.origin = m.bodies[root].start.t;
         zone.ground_height = m_model.ground.height - zone.origin.z();
         zone.bodies.clear();
@@ -272,7 +275,8 @@ private:
             const ZoneContact& contact = zone.contacts[active.index];
             const Contact& c = contact.contact;
             m.contacts.push_back(c);
-            outcome.max_compression = std::max(outcome.max_compression, contact.range.rest - active.geometry.distance);
+            m.shifts.push_back(contact.shift);
+            outcome.max_compression = std::max(outcome.max_compression, contact.range.rest - contact.shift - active.geometry.distance);
             std::uint64_t& hash = outcome.signature;
             hash = mix(hash, pack(c.object_a, static_cast<std::uint32_t>(c.object_b)));
             hash = mix(hash, pack(c.feature_a, static_cast<std::uint32_t>(c.feature_b)));
@@ -366,9 +370,9 @@ private:
         const auto for_each_contact = [&](const auto& visit) {
             for (int root : m.dynamic)
                 for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k)
-                    visit(m.contacts[k]);
+                    visit(k);
         };
-        for_each_contact([&](const Contact& c) { ++m.zone_contact_end[zone_of_contact(c)]; });
+        for_each_contact([&](int k) { ++m.zone_contact_end[zone_of_contact(m.contacts[k])]; });
         int bodies = 0, contacts = 0;
         for (std::size_t z = 0; z < m.zone_body_end.size(); ++z) {
             m_info.largest_zone = std::max(m_info.largest_zone, m.zone_body_end[z]);
@@ -379,7 +383,12 @@ private:
         m.zone_contacts.resize(static_cast<std::size_t>(contacts));
         for (int i : m.dynamic)
             if (m.zone_of[i] >= 0) m.zone_bodies[m.zone_body_end[m.zone_of[i]]++] = i;
-        for_each_contact([&](const Contact& c) { m.zone_contacts[m.zone_contact_end[zone_of_contact(c)]++] = c; });
+        m.zone_shifts.resize(m.zone_contacts.size());
+        for_each_contact([&](int k) {
+            const int slot = m.zone_contact_end[zone_of_contact(m.contacts[k])]++;
+            m.zone_contacts[slot] = m.contacts[k];
+            m.zone_shifts[slot] = m.shifts[k];
+        });
     }
 
     SceneState finish() {
@@ -431,6 +440,7 @@ private:
         record.zone_body_end = m.zone_body_end;
         record.zone_contact_end = m.zone_contact_end;
         record.contacts = m.zone_contacts;
+        if (m_options.compliance == 0.0) record.shifts = m.zone_shifts;
     }
 
     const Model& m_model;

@@ -21,6 +21,7 @@ struct StepRecord {
     /// Dynamic bodies in contact, zone after zone, and the active contacts of each zone.
     std::vector<int> zone_bodies, zone_body_end, zone_contact_end;
     std::vector<Contact> contacts;
+    std::vector<double> shifts;  ///< of hard contacts' rest distances; empty when contacts give way
 
     std::size_t bytes() const;
 };

@@ -68,7 +68,7 @@ private:
     void solve_zone_adjoint(int first_body, int body_end, int first_contact, int contact_end) {
         Zone& zone = m_workspace.zone_problem;
         zone.model = &m_model;
-        zone.compliance = m_options.compliance;
+        set_compliance(zone, m_options.compliance);
         zone.bodies.clear();
         zone.contacts.clear();
         zone.pairs.clear();
@@ -109,6 +109,8 @@ private:
             entry.pair = -1;
             entry.range =
                 contact_range(m_model.margin(contact.object_a) + m_model.margin(contact.object_b), m_model.thickness);
+            if (zone.hard) entry.shift = m_record.shifts[c];
+            entry.range.rest += entry.shift;
             entry.stiffness = contact_stiffness(zone.bodies[a].mass, mass_b, zone.compliance);
             if (b != kGround && a < zone.dynamic_count && b < zone.dynamic_count)
                 zone.pairs.emplace_back(std::min(a, b), std::max(a, b));

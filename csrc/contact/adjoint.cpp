@@ -110,6 +110,47 @@ Coordinates solve_qr(const Zone& zone, const Rows& rows, const Coordinates& upst
     return unflatten(v);
 }
 
+/// Hard contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
+/// gives way. Every step leaves about a compliance's part; they end when z no longer changes, since a small J z alone
+/// does not mean that z is right. Returns the reactions, the last step's left out: the soft contacts carry it.
+template <typename Solve>
+std::vector<double> harden(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const Solve& solve,
+                           Coordinates& z) {
+    constexpr int kMaxSteps = 30;
+    constexpr double kTolerance = 1e-14;  // on the change of z, relative: rounding
+    std::vector<ContactDerivatives> contacts;
+    for (const ActiveContact& active : point.active) contacts.push_back(derivatives_of(zone, point, active, false));
+    std::vector<double> reactions(contacts.size(), 0.0);
+    for (int step = 0; step < kMaxSteps; ++step) {
+        std::vector<double> next = reactions;
+        Coordinates rhs = upstream;
+        for (std::size_t k = 0; k < contacts.size(); ++k) {
+            const ZoneContact& contact = zone.contacts[point.active[k].index];
+            const auto along = [&](int body, const Vec6& row) {
+                return body >= 0 && body < zone.dynamic_count ? row.dot(chart_jacobian(point.y[body]) * z[body]) : 0.0;
+            };
+            next[k] += contacts[k].stiffness *
+                       (along(contact.a, contacts[k].row.head<6>()) + along(contact.b, contacts[k].row.tail<6>()));
+            const auto react = [&](int body, const Vec6& row) {
+                if (body >= 0 && body < zone.dynamic_count)
+                    rhs[body] -= next[k] * (chart_jacobian(point.y[body]).transpose() * row);
+            };
+            react(contact.a, contacts[k].row.head<6>());
+            react(contact.b, contacts[k].row.tail<6>());
+        }
+        const Coordinates better = solve(rhs);
+        double change = 0.0, size = 0.0;
+        for (std::size_t i = 0; i < z.size(); ++i) {
+            change = std::max(change, (better[i] - z[i]).norm());
+            size = std::max(size, better[i].norm());
+        }
+        z = better;
+        reactions = next;
+        if (change <= kTolerance * size) break;
+    }
+    return reactions;
+}
+
 }  // namespace
 
 ZoneAdjoint zone_adjoint(
@@ -125,13 +166,18 @@ ZoneAdjoint zone_adjoint(
             differentiate(zone, point, Curvature::projected, derivatives, &system);
             system.factorize();
         }
-        result.multiplier = upstream;
-        system.solve_in_place(result.multiplier);
-    } else {
-        const Rows rows = collect_rows(zone, point);
-        result.multiplier =
-            mode == AdjointMode::dense ? solve_dense(zone, rows, upstream) : solve_qr(zone, rows, upstream);
     }
+    const Rows rows = exact ? Rows{} : collect_rows(zone, point);
+    const auto solve = [&](const Coordinates& rhs) {
+        if (mode == AdjointMode::dense) return solve_dense(zone, rows, rhs);
+        if (mode == AdjointMode::qr) return solve_qr(zone, rows, rhs);
+        Coordinates z = rhs;
+        system.solve_in_place(z);
+        return z;
+    };
+    result.multiplier = solve(upstream);
+    const std::vector<double> reactions =
+        zone.hard ? harden(zone, point, upstream, solve, result.multiplier) : std::vector<double>();
 
     result.pose_gradient.assign(static_cast<std::size_t>(zone.body_count()), Vec6::Zero());
     result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
@@ -140,13 +186,15 @@ ZoneAdjoint zone_adjoint(
         twist[i] = result.multiplier[i];
         twist[i].head<3>() = left_jacobian(point.y[i].head<3>()) * result.multiplier[i].head<3>();
     }
-    for (const ActiveContact& active : point.active) {
+    for (std::size_t k = 0; k < point.active.size(); ++k) {
+        const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
         const ContactDerivatives d = derivatives_of(zone, point, active, exact);
         double along;  // of the contact's gradient along the multiplier's twists
         if (contact.contact.with_ground()) {
             result.pose_gradient[contact.a] -= d.hessian.topLeftCorner<6, 6>() * twist[contact.a];
             along = d.gradient.head<6>().dot(twist[contact.a]);
+            if (zone.hard) result.pose_gradient[contact.a] -= reactions[k] * d.row.head<6>();
         } else {
             Vec12 both;
             both << twist[contact.a], twist[contact.b];
@@ -154,7 +202,12 @@ ZoneAdjoint zone_adjoint(
             result.pose_gradient[contact.a] -= gradient.head<6>();
             result.pose_gradient[contact.b] -= gradient.tail<6>();
             along = d.gradient.dot(both);
+            if (zone.hard) {
+                result.pose_gradient[contact.a] -= reactions[k] * d.row.head<6>();
+                result.pose_gradient[contact.b] -= reactions[k] * d.row.tail<6>();
+            }
         }
+        if (zone.hard) continue;  // the stiffness is only how the multipliers were found
         if (contact.a < zone.dynamic_count) result.mass_gradient[contact.a] -= along * contact.stiffness.log_gradient_a;
         if (contact.b >= 0 && contact.b < zone.dynamic_count)
             result.mass_gradient[contact.b] -= along * contact.stiffness.log_gradient_b;

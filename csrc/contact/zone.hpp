@@ -44,12 +44,14 @@ struct ZoneContact {
     int pair;  ///< block of the Hessian, or -1 when one of the two does not yield
     ContactRange range;
     ContactStiffness stiffness;
+    double shift = 0.0;  ///< of range.rest, so that a hard contact's force acts at its rest distance [m]
 };
 
 /// Bodies (the dynamic ones first) and the contacts that can become active.
 struct Zone {
     const Model* model = nullptr;
-    double compliance = 0.0;
+    double compliance = 0.0;  ///< of the contacts; with `hard`, of the steps towards their multipliers
+    bool hard = false;        ///< contacts do not give way: Eq. 6 as written
     Vec3 origin = Vec3::Zero();  ///< of the zone frame, world
     double ground_height = 0.0;  ///< zone frame
     std::vector<ZoneBody> bodies;
@@ -60,6 +62,12 @@ struct Zone {
     const CollisionMesh& mesh(int body) const { return model->bodies[bodies[body].id].mesh; }
     int body_count() const { return static_cast<int>(bodies.size()); }
 };
+
+/// Compliance 0 asks for hard contacts.
+inline void set_compliance(Zone& zone, double compliance) {
+    zone.hard = compliance == 0.0;
+    zone.compliance = zone.hard ? kDefaultCompliance : compliance;
+}
 
 /// Pose of a body at its coordinates.
 Pose pose_at(const ZoneBody& body, const Vec6& y);

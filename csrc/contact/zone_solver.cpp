@@ -10,6 +10,8 @@ constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
 constexpr int kMaxStalls = 3;              // steps in a row that get a driven body nowhere
 constexpr double kStall = 1e-3;            // of the way that is left
+constexpr double kHardTolerance = 1e-9;    // change of a hard contact's compression, of its range
+constexpr int kMaxHardRounds = 50;
 constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
 constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
 constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
@@ -29,6 +31,7 @@ public:
         if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
         go_to_warm_start();
         iterate();
+        if (m_zone.hard) harden();
         return m_result;
     }
 
@@ -160,7 +163,8 @@ private:
             residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
             reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
         }
-        if (!(reference > 0.0)) return {0.0, 0.0};
+        // Nothing pushes here and nothing did before: only the exact answer will do, or a step lost in rounding.
+        if (!(reference > 0.0)) return {residual > 0.0 ? 1.0 : 0.0, 0.0};
         return {residual / reference, kEpsilon * m_position * m_w.derivatives.largest_stiffness / reference};
     }
 
@@ -342,6 +346,28 @@ private:
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial);
         if (m_w.trial.energy <= m_w.point.energy + energy_noise()) accept_trial();
+    }
+
+    /// Multiplier updates [the method of multipliers]: shift each contact's rest distance by its compression, so that the
+    /// same force acts with less of it, until there is none left. Every round leaves about a compliance's part.
+    void harden() {
+        for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
+            double violation = 0.0;
+            for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+                ZoneContact& contact = m_zone.contacts[k];
+                const double compression = std::max(contact.range.rest - m_w.point.distances[k], 0.0);
+                const double depth = contact.range.rest - contact.shift - contact.range.floor;
+                violation = std::max(violation, std::abs(compression - contact.shift) / depth);
+                contact.range.rest += compression - contact.shift;
+                contact.shift = compression;
+            }
+            if (violation <= kHardTolerance) return;
+            if (round >= kMaxHardRounds) return fail(ZoneStatus::too_many_iterations);
+            evaluate(m_zone, m_w.point);
+            const int iterations = m_result.iterations;
+            iterate();
+            m_result.iterations += iterations;
+        }
     }
 
     void fail(ZoneStatus status) { m_result.status = status; }

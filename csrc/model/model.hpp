@@ -44,9 +44,12 @@ struct Model {
 /// How the backward of a step treats the contact terms; see contact/adjoint.hpp.
 enum class AdjointMode { exact, qr, dense };
 
+/// Contacts give way to a resting body's weight by about this part of what gravity moves it in a step.
+inline constexpr double kDefaultCompliance = 1e-4;
+
 struct Options {
     double dt = 0.01;                          ///< [s]
-    double compliance = 1e-4;                  ///< inverse contact stiffness in units of (reduced mass / step²) [1]
+    double compliance = kDefaultCompliance;                  ///< inverse contact stiffness in units of (reduced mass / step²) [1]
     AdjointMode adjoint = AdjointMode::exact;  ///<
     double tolerance = 1e-10;                  ///< on the force balance, relative to the largest contact force [1]
     int max_iterations = 200;                  ///< Newton steps per zone and step
