@@ -81,7 +81,7 @@ struct StepWorkspace::ForwardScratch {
     std::vector<int> members, member_end;  ///< dynamic bodies sorted by group; where each group ends, by smallest body
     std::vector<Box> boxes, zone_visited;
     std::vector<Contact> contacts;              ///< active, group after group
-    std::vector<double> shifts;  ///< of their rest distances
+    std::vector<double> shifts;                 ///< of their rest distances
     std::vector<std::pair<int, Vec6>> blocked;  ///< kinematic bodies that did not reach their targets: where they are
     std::vector<int> near;
     std::vector<int> zone_bodies, zone_body_end, zone_contact_end;  ///< as in StepRecord
@@ -276,7 +276,8 @@ private:
             const Contact& c = contact.contact;
             m.contacts.push_back(c);
             m.shifts.push_back(contact.shift);
-            outcome.max_compression = std::max(outcome.max_compression, contact.range.rest - contact.shift - active.geometry.distance);
+            outcome.max_compression =
+                std::max(outcome.max_compression, contact.range.rest - contact.shift - active.geometry.distance);
             std::uint64_t& hash = outcome.signature;
             hash = mix(hash, pack(c.object_a, static_cast<std::uint32_t>(c.object_b)));
             hash = mix(hash, pack(c.feature_a, static_cast<std::uint32_t>(c.feature_b)));
@@ -369,8 +370,7 @@ private:
         };
         const auto for_each_contact = [&](const auto& visit) {
             for (int root : m.dynamic)
-                for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k)
-                    visit(k);
+                for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k) visit(k);
         };
         for_each_contact([&](int k) { ++m.zone_contact_end[zone_of_contact(m.contacts[k])]; });
         int bodies = 0, contacts = 0;

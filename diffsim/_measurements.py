@@ -28,6 +28,7 @@ class Measurements(nn.Module):
     gravity: nn.Parameter
     _packed: PackedScene
     _model: _core.Model
+    _options: _core.Options
     _body_count: int
     _node_count: int
 

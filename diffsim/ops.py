@@ -37,6 +37,7 @@ class Info:
 
     converged: bool  #: every step of every scene of the call
     failed_steps: int  #: steps of the call that did not converge, all scenes
+    failure: str  #: why the first of them did not; "" if all converged
     contacts: int  #: contacts in the zones' optimizations
     zones: int  #: independent groups of bodies in contact
     largest_zone: int  #: bodies in the largest of them
@@ -108,7 +109,7 @@ class RolloutCall:
         self.signature: np.ndarray | None = None  # uint64 hash of the active contacts, shape (steps[, B])
 
 
-def _array(tensor: Tensor | None) -> np.ndarray | None:
+def _array(tensor: Tensor | None) -> Any:  # a float64 array or None, as the core wants it at that place
     if tensor is None:
         return None
     if not tensor.is_contiguous():
@@ -116,7 +117,7 @@ def _array(tensor: Tensor | None) -> np.ndarray | None:
     return tensor.numpy(force=True)  # force: also where it requires grad; no copy on the cpu
 
 
-def _run(call: RolloutCall, arrays: list[np.ndarray | None], record: bool) -> _core.Rollout:
+def _run(call: RolloutCall, arrays: list[Any], record: bool) -> _core.Rollout:
     return _core.rollout(
         call.model,
         call.options,
@@ -184,10 +185,11 @@ class _RolloutBackward(torch.autograd.Function):
     def forward(backward_call: _BackwardCall, *tensors: Tensor | None) -> OptionalTensors:
         call = backward_call.call
         arrays = [_array(t) for t in tensors]
-        tape = call.tape
-        if tape is None:  # checkpointing: the same bits again, recorded this time, and dropped after use
-            tape = _run(call, arrays[:11], record=True).tape
-        grads = _core.rollout_backward(tape, *arrays, needs=backward_call.needs, num_threads=call.num_threads)
+        # Without a tape, checkpointing: the same bits again, recorded this time, and dropped after use.
+        tape = call.tape or _run(call, arrays[:11], record=True).tape
+        assert tape is not None  # it was recorded
+        needs = backward_call.needs
+        grads = _core.rollout_backward(tape, *arrays, needs=needs, num_threads=call.num_threads)  # type: ignore[misc]
         return tuple(None if g is None else torch.from_numpy(g) for g in grads)
 
     @staticmethod

@@ -22,6 +22,17 @@ from .state import Control, State
 
 __all__ = ["Simulator"]
 
+# What to try, by why the core says a step failed.
+_MENDS = {
+    "max_iterations reached": "try a larger max_iterations or a smaller dt",
+    "no step lowers the energy": "try a smaller dt or a larger tolerance",
+    "a driven body is blocked: something is squeezed": (
+        "check what the kinematic bodies squeeze and how far they are driven, or try a smaller dt"
+    ),
+    "objects penetrate at the start": "move them apart, for instance with sim.separate(state)",
+}
+_USUAL_MEND = "try a smaller dt or a larger max_iterations"
+
 _PROGRESS_UPDATES = 100  # of a rollout that is not cut into segments for checkpointing
 
 
@@ -41,9 +52,11 @@ class Simulator(Measurements):
         scene: Read now; later changes to it have no effect.
         dt: Time step [s].
         thickness: Distance kept between surfaces of default margin [m]. Default: 1e-3 of the scene's smallest extent.
-        compliance: How far contacts give way, relative to hard contact; 0 is hard contact.
+        compliance: How far contacts give way: about this part of what gravity moves a body in one step. 0: not at all,
+            at the price of a few more Newton steps (the quadratic program of Eq. 6 as written).
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
-        coupling: "monolithic".
+        coupling: "monolithic" or "split": whether cloth and what touches it are solved at once. Without cloth the two
+            are the same, and there is no cloth yet.
         tolerance: Relative KKT residual at which a step has converged.
         max_iterations: Newton iterations a step may take.
         num_threads: Solve that much at a time; no result depends on it. Default: `torch.get_num_threads()`.
@@ -51,8 +64,7 @@ class Simulator(Measurements):
             (`SolverError`).
         check: Whether to look for overlaps in the scene, and for parameter values this version does not know. Types and
             shapes are always checked.
-    Raises: TypeError, ValueError for what the message names, overlapping bodies among it; NotImplementedError for
-        ``coupling="split"``.
+    Raises: TypeError, ValueError for what the message names, overlapping bodies among it.
     """
 
     friction: nn.Parameter
@@ -84,12 +96,11 @@ class Simulator(Measurements):
         check_choice(where, "adjoint", adjoint, ("exact", "qr", "dense"))
         check_choice(where, "coupling", coupling, ("monolithic", "split"))
         check_choice(where, "on_failure", on_failure, ("warn", "raise"))
-        if coupling == "split":
-            raise NotImplementedError('Simulator: coupling="split" is not implemented yet; use "monolithic"')
+        compliance = check_number(where, "compliance", compliance, least=0.0)
         self._dt = check_number(where, "dt", dt, above=0.0)
-        self._settings = {
+        self._settings: dict[str, Any] = {
             "dt": self._dt,
-            "compliance": check_number(where, "compliance", compliance, least=0.0),
+            "compliance": compliance,
             "adjoint": adjoint,
             "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
             "max_iterations": check_count(where, "max_iterations", max_iterations),
@@ -176,7 +187,9 @@ class Simulator(Measurements):
         """
         p = self._packed
         if self._separated is None:
-            position, orientation, _ = _core.separate(self._model, self._options, p.position, p.orientation, p.mass, p.inertia)
+            position, orientation, _ = _core.separate(
+                self._model, self._options, p.position, p.orientation, p.mass, p.inertia
+            )
             self._separated = position, orientation
         arrays = (*self._separated, p.velocity, p.angular_velocity)
         tensors = [torch.from_numpy(a).to(self.mass.dtype) for a in arrays]
@@ -363,9 +376,10 @@ class Simulator(Measurements):
         info = self.info
         assert info is not None  # a call was made
         text = (
-            f"Simulator: {info.failed_steps} step(s) did not converge; the last step of the call took {info.iterations}"
-            f" iterations to a relative residual of {info.residual:.3g} (tolerance {self._settings['tolerance']:g})."
-            " The last penetration-free state is returned; try a smaller dt or more max_iterations; see also sim.info"
+            f"Simulator: {info.failed_steps} step(s) did not converge, the first because: {info.failure}. The last step"
+            f" of the call took {info.iterations} iterations to a relative residual of {info.residual:.3g} (tolerance"
+            f" {self._settings['tolerance']:g}). The last penetration-free state is returned;"
+            f" {_MENDS.get(info.failure, _USUAL_MEND)}; see also sim.info"
         )
         if self._on_failure == "raise":
             raise SolverError(text, info, result)
@@ -432,6 +446,7 @@ def _combined(segments: list[Any]) -> Info:
     return Info(
         converged=all(segment.converged for segment in segments),
         failed_steps=sum(segment.failed_steps for segment in segments),
+        failure=next((segment.failure for segment in segments if not segment.converged), ""),
         contacts=last.contacts,
         zones=last.zones,
         largest_zone=last.largest_zone,

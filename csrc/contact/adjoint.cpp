@@ -114,8 +114,8 @@ Coordinates solve_qr(const Zone& zone, const Rows& rows, const Coordinates& upst
 /// gives way. Every step leaves about a compliance's part; they end when z no longer changes, since a small J z alone
 /// does not mean that z is right. Returns the reactions, the last step's left out: the soft contacts carry it.
 template <typename Solve>
-std::vector<double> harden(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const Solve& solve,
-                           Coordinates& z) {
+std::vector<double> harden(
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const Solve& solve, Coordinates& z) {
     constexpr int kMaxSteps = 30;
     constexpr double kTolerance = 1e-14;  // on the change of z, relative: rounding
     std::vector<ContactDerivatives> contacts;

@@ -7,9 +7,10 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxRounds = 40;
-constexpr int kMaxNewtonSteps = 100;
-constexpr double kQpTolerance = 1e-9;  // of the starting gradient: a search direction needs no more
-constexpr double kMaxTurn = 0.5;       // [rad] in one direction: rows hold their meaning over that
+constexpr int kMaxNewtonSteps = 50;
+constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
+constexpr double kQpTolerance = 1e-7;    // of the starting gradient: a search direction needs no more
+constexpr double kMaxTurn = 0.5;         // [rad] in one direction: rows hold their meaning over that
 constexpr int kMaxTurnLimits = 5;
 constexpr double kNearby = 2.0;        // pairs this many contact ranges away are rows from the start
 constexpr double kImpactWindow = 0.5;  // later impacts of two bodies count up to this part of the smaller radius
@@ -46,7 +47,7 @@ double exact_line_search(
         (derivative > 0.0 ? upper : lower) = t;
         double next = t - derivative / curvature;
         if (!(next > lower && next < upper)) next = upper < kInfinity ? 0.5 * (lower + upper) : 2.0 * t;
-        if (std::abs(next - t) <= 1e-14 * t) break;
+        if (std::abs(next - t) <= kLineTolerance * t) break;
         t = next;
     }
     return t;

@@ -8,9 +8,9 @@ namespace {
 
 constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
-constexpr int kMaxStalls = 3;              // steps in a row that get a driven body nowhere
-constexpr double kStall = 1e-3;            // of the way that is left
-constexpr double kHardTolerance = 1e-9;    // change of a hard contact's compression, of its range
+constexpr int kMaxStalls = 3;            // steps in a row that get a driven body nowhere
+constexpr double kStall = 1e-3;          // of the way that is left
+constexpr double kHardTolerance = 1e-9;  // change of a hard contact's compression, of its range
 constexpr int kMaxHardRounds = 50;
 constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
 constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier

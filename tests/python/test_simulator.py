@@ -1,5 +1,6 @@
 import copy
 import pickle
+import re
 import resource
 import sys
 import warnings
@@ -13,7 +14,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 import diffsim as ds
-from diffsim import _core
+from diffsim import _core, simulator
 
 STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
 STATM = Path("/proc/self/statm")
@@ -77,7 +78,6 @@ def assert_same(a: ds.State, b: ds.State) -> None:
         ({"compliance": -1.0}, ValueError, "compliance must be finite and at least 0, got -1.0"),
         ({"adjoint": "fast"}, ValueError, "adjoint must be one of 'exact', 'qr', 'dense', got 'fast'"),
         ({"coupling": "none"}, ValueError, "coupling must be one of 'monolithic', 'split', got 'none'"),
-        ({"coupling": "split"}, NotImplementedError, 'coupling="split" is not implemented yet'),
         ({"tolerance": 0.0}, ValueError, "tolerance must be finite and larger than 0"),
         ({"max_iterations": 0}, ValueError, "max_iterations must be at least 1, got 0"),
         ({"max_iterations": 2.5}, TypeError, "max_iterations must be a whole number, got float"),
@@ -545,6 +545,7 @@ def test_info_of_the_last_call(sim: ds.Simulator, state: ds.State) -> None:
     info = sim.info
     assert isinstance(info, ds.Info)
     assert info.converged
+    assert info.failure == ""
     assert (info.failed_steps, info.contacts, info.zones, info.largest_zone) == (0, 0, 0, 0)
     assert all(isinstance(value, float) for value in info.milliseconds.values())
 
@@ -561,12 +562,14 @@ def test_info_in_contact() -> None:
 
 def test_failure_in_contact_warns_once_and_returns_a_good_state() -> None:
     sim = falling_box(max_iterations=1)
-    with pytest.warns(ds.ConvergenceWarning, match=r"did not converge.*penetration-free") as caught:
+    expected = r"did not converge, the first because: max_iterations reached\..*penetration-free.*larger max_iterations"
+    with pytest.warns(ds.ConvergenceWarning, match=expected) as caught:
         trajectory = sim.rollout(sim.initial_state(), None, 40, checkpoint_every=10)
     assert caught[0].filename == __file__
     assert sim.info is not None
     assert not sim.info.converged
     assert sim.info.failed_steps >= 1
+    assert sim.info.failure == "max_iterations reached"
     assert torch.isfinite(trajectory.position).all()
     distance = sim.min_distance(trajectory)
     assert isinstance(distance, Tensor)
@@ -592,13 +595,20 @@ def test_warning_of_a_step_in_contact_points_at_the_caller() -> None:
 
 def test_failure_in_contact_raises_if_asked_to() -> None:
     sim = falling_box(max_iterations=1, on_failure="raise")
-    with pytest.raises(ds.SolverError, match="did not converge") as caught:
+    with pytest.raises(ds.SolverError, match=r"did not converge, the first because: max_iterations reached") as caught:
         sim.rollout(sim.initial_state(), None, 40)
     error = pickle.loads(pickle.dumps(caught.value))
     assert error.iterations == caught.value.iterations >= 0
     assert error.residual == caught.value.residual
     assert error.state.leading_shape == (40,)
     assert error.info == sim.info
+
+
+def test_a_mend_is_known_for_every_failure_of_the_core() -> None:
+    source = Path(__file__).parents[2] / "csrc" / "bindings" / "bind_rollout.cpp"
+    function = re.search(r"failure_text\(.*?^}", source.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    assert function is not None
+    assert set(re.findall(r'return "(.+)";', function[0])) == set(simulator._MENDS)
 
 
 # ---- measurements ----------------------------------------------------------------------------------------------------

@@ -1,0 +1,165 @@
+"""The C++ core of diffsim. Not a public interface: use the diffsim package.
+
+Written by hand after pybind11-stubgen; tests/python/test_stub.py compares it with the compiled module. Arrays are
+C-contiguous: another layout or dtype is a TypeError, not a copy.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+class Model:
+    """Bodies, their collision meshes and the ground."""
+
+    def __init__(
+        self,
+        *,
+        names: Sequence[str],
+        kind: NDArray[np.int32],
+        margin: NDArray[np.float64],
+        vertex_count: NDArray[np.int32],
+        vertices: NDArray[np.float64],
+        face_count: NDArray[np.int32],
+        faces: NDArray[np.int32],
+        has_ground: bool,
+        ground_height: float,
+        ground_margin: float,
+        thickness: float,
+    ) -> None: ...
+    @property
+    def body_count(self) -> int: ...
+
+class Options:
+    """How steps are taken."""
+
+    def __init__(
+        self,
+        *,
+        dt: float,
+        compliance: float = 0.0001,
+        adjoint: str = "exact",
+        tolerance: float = 1e-10,
+        max_iterations: int = 200,
+    ) -> None: ...
+    dt: float
+    compliance: float
+    adjoint: str
+    tolerance: float
+    max_iterations: int
+
+class Tape:
+    """What the backward of a rollout needs."""
+
+    @property
+    def nbytes(self) -> int: ...
+
+class Info:
+    """Statistics of a rollout; counts are those of its last step."""
+
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def failed_steps(self) -> int: ...
+    @property
+    def failure(self) -> str: ...
+    @property
+    def contacts(self) -> int: ...
+    @property
+    def zones(self) -> int: ...
+    @property
+    def largest_zone(self) -> int: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def residual(self) -> float: ...
+    @property
+    def max_compression(self) -> float: ...
+    @property
+    def milliseconds(self) -> dict[str, float]: ...
+
+class Rollout:
+    """Trajectory, tape and statistics."""
+
+    @property
+    def position(self) -> NDArray[np.float64]: ...
+    @property
+    def orientation(self) -> NDArray[np.float64]: ...
+    @property
+    def velocity(self) -> NDArray[np.float64]: ...
+    @property
+    def angular_velocity(self) -> NDArray[np.float64]: ...
+    @property
+    def tape(self) -> Tape | None: ...
+    @property
+    def info(self) -> Info: ...
+    @property
+    def signature(self) -> NDArray[np.uint64]: ...
+
+def rollout(
+    model: Model,
+    options: Options,
+    position: NDArray[np.float64],
+    orientation: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    angular_velocity: NDArray[np.float64],
+    force: NDArray[np.float64] | None,
+    torque: NDArray[np.float64] | None,
+    body_velocity: NDArray[np.float64] | None,
+    body_angular_velocity: NDArray[np.float64] | None,
+    mass: NDArray[np.float64],
+    inertia: NDArray[np.float64],
+    gravity: NDArray[np.float64],
+    *,
+    steps: int,
+    controls_have_time: bool,
+    keep_time: bool,
+    record: bool,
+    num_threads: int,
+) -> Rollout: ...
+def rollout_backward(
+    tape: Tape,
+    position: NDArray[np.float64],
+    orientation: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    angular_velocity: NDArray[np.float64],
+    force: NDArray[np.float64] | None,
+    torque: NDArray[np.float64] | None,
+    body_velocity: NDArray[np.float64] | None,
+    body_angular_velocity: NDArray[np.float64] | None,
+    mass: NDArray[np.float64],
+    inertia: NDArray[np.float64],
+    gravity: NDArray[np.float64],
+    grad_position: NDArray[np.float64] | None,
+    grad_orientation: NDArray[np.float64] | None,
+    grad_velocity: NDArray[np.float64] | None,
+    grad_angular_velocity: NDArray[np.float64] | None,
+    needs: Sequence[bool],
+    num_threads: int,
+) -> tuple[NDArray[np.float64] | None, ...]: ...
+def separate(
+    model: Model,
+    options: Options,
+    position: NDArray[np.float64],
+    orientation: NDArray[np.float64],
+    mass: NDArray[np.float64],
+    inertia: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]: ...
+def min_distance(
+    model: Model, position: NDArray[np.float64], orientation: NDArray[np.float64]
+) -> tuple[float, int, int]: ...
+def vertex_polygon_toi(
+    vertex: NDArray[np.float64],
+    polygon0: NDArray[np.float64],
+    polygon1: NDArray[np.float64],
+    min_distance: float,
+    tolerance: float,
+) -> float: ...
+def edge_edge_toi(
+    a0: NDArray[np.float64],
+    a1: NDArray[np.float64],
+    b0: NDArray[np.float64],
+    b1: NDArray[np.float64],
+    min_distance: float,
+    tolerance: float,
+) -> float: ...
