@@ -10,11 +10,12 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
+from _common import in_turns, print_header, print_row
 from torch import Tensor
 
 import diffsim as ds
@@ -59,11 +60,9 @@ def cases() -> dict[str, Callable[[], object]]:
     }
 
 
-def microseconds(call: Callable[[], object], repeats: int) -> float:
-    start = time.perf_counter_ns()
+def repeated(call: Callable[[], object], repeats: int) -> None:
     for _ in range(repeats):
         call()
-    return (time.perf_counter_ns() - start) / repeats / 1e3
 
 
 def main() -> int:
@@ -73,19 +72,17 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=500, help="calls per round")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    timed = cases()
-    print(",".join(COLUMNS))
+    timed = {name: partial(repeated, call, options.repeats) for name, call in cases().items()}
+    print_header()
+    print_row(COLUMNS)
     for run in range(options.runs):
-        rounds: dict[str, list[float]] = {name: [] for name in timed}
-        for _ in range(options.rounds):
-            for name, call in timed.items():
-                rounds[name].append(microseconds(call, options.repeats))
-        us = {name: statistics.median(values) for name, values in rounds.items()}
-        values = []
+        seconds = in_turns(timed, options.rounds)
+        us = {name: 1e6 * statistics.median(values) / options.repeats for name, values in seconds.items()}
+        values: list[float] = []
         for direction in ("forward", "backward"):
             nothing, step = us[f"nothing_{direction}"], us[f"step_{direction}"]
             values += [nothing, step, step / nothing]
-        print(run, *(f"{value:.2f}" for value in values), sep=",", flush=True)
+        print_row([run, *values])
     return 0
 
 

@@ -11,7 +11,7 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxBlocked = 8;  // shortenings of a blocked drive before it is stopped
+constexpr int kMaxBlocked = 2;  // shortenings of a blocked drive before it is stopped
 
 using Clock = std::chrono::steady_clock;
 

@@ -93,8 +93,15 @@ Coordinates solve_qr(const Zone& zone, const Rows& rows, const Coordinates& upst
         factors.push_back(mass_matrix(zone.bodies[i]).llt().matrixL());
         const auto L = factors.back().triangularView<Eigen::Lower>();
         L.solveInPlace(v.segment<6>(6 * i));
+        if (m == 0) continue;
         auto block = Bt.middleRows<6>(6 * i);
         block = L.solve(block).eval();
+    }
+    if (m == 0) {
+        for (int i = 0; i < zone.dynamic_count; ++i)
+            factors[static_cast<std::size_t>(i)].triangularView<Eigen::Lower>().transpose().solveInPlace(
+                v.segment<6>(6 * i));
+        return unflatten(v);
     }
     const Eigen::ColPivHouseholderQR<MatrixX> qr(Bt);
     const Eigen::Index rank = std::min(n, m);

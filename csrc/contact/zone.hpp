@@ -50,8 +50,8 @@ struct ZoneContact {
 /// Bodies (the dynamic ones first) and the contacts that can become active.
 struct Zone {
     const Model* model = nullptr;
-    double compliance = 0.0;  ///< of the contacts; with `hard`, of the steps towards their multipliers
-    bool hard = false;        ///< contacts do not give way: Eq. 6 as written
+    double compliance = 0.0;     ///< of the contacts; with `hard`, of the steps towards their multipliers
+    bool hard = false;           ///< contacts do not give way: Eq. 6 as written
     Vec3 origin = Vec3::Zero();  ///< of the zone frame, world
     double ground_height = 0.0;  ///< zone frame
     std::vector<ZoneBody> bodies;

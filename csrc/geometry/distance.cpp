@@ -91,6 +91,9 @@ ClosestPoints closest_edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, 
         consider(1.0, nearest_parameter(a1, b0, db, bb));
         consider(nearest_parameter(b0, a0, da, aa), 0.0);
         consider(nearest_parameter(b1, a0, da, aa), 1.0);
+        // Squared distances tie in rounding over sqrt(eps) of a parameter; a projection settles what they cannot.
+        best_s = nearest_parameter(b0 + best_t * db, a0, da, aa);
+        best_t = nearest_parameter(a0 + best_s * da, b0, db, bb);
     }
     ClosestPoints result;
     result.point_a = a0 + best_s * da;

@@ -49,7 +49,7 @@ inline constexpr double kDefaultCompliance = 1e-4;
 
 struct Options {
     double dt = 0.01;                          ///< [s]
-    double compliance = kDefaultCompliance;                  ///< inverse contact stiffness in units of (reduced mass / step²) [1]
+    double compliance = kDefaultCompliance;    ///< inverse contact stiffness in units of (reduced mass / step²) [1]
     AdjointMode adjoint = AdjointMode::exact;  ///<
     double tolerance = 1e-10;                  ///< on the force balance, relative to the largest contact force [1]
     int max_iterations = 200;                  ///< Newton steps per zone and step

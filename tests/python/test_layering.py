@@ -11,12 +11,14 @@ CSRC = Path(__file__).resolve().parents[2] / "csrc"
 ROOMS = {
     "math": [],
     "geometry": ["math"],
-    "model": ["math"],
+    "model": ["geometry"],
     "dynamics": ["model", "geometry"],
     "collision": ["geometry"],
     "contact": ["model", "collision"],
     "step": ["dynamics", "contact"],
-    "bindings": ["step"],
+    "scene_queries": ["step"],
+    "rollout": ["step"],
+    "bindings": ["rollout", "scene_queries"],
 }
 PYTHON_ROOM = "bindings"  # the only one that sees Python
 
@@ -29,8 +31,8 @@ def reachable_rooms(room: str) -> set[str]:
 
 
 def room_of(path: Path, csrc: Path) -> str:
-    """The first folder, or for a file directly in csrc its name: csrc/step.cpp is in room step."""
-    return Path(path.relative_to(csrc).parts[0]).stem
+    """The first folder, or for a file directly in csrc its name; step.cpp and step_backward.cpp are both room step."""
+    return Path(path.relative_to(csrc).parts[0]).stem.removesuffix("_backward")
 
 
 def violations(csrc: Path) -> list[str]:
@@ -64,13 +66,18 @@ def tree(tmp_path: Path) -> Path:
     for name, text in {
         "math/rotation.hpp": "#include <Eigen/Core>\n",
         "geometry/mesh.hpp": '#include "math/rotation.hpp"\n',
-        "model/model.hpp": '#include "math/rotation.hpp"\n',
+        "model/model.hpp": '#include "geometry/mesh.hpp"\n',
         "dynamics/solve.hpp": '#include "geometry/mesh.hpp"\n#include "model/model.hpp"\n',
         "collision/ccd.hpp": '#include "geometry/mesh.hpp"\n#include "math/rotation.hpp"\n',
         "contact/zone.hpp": '#include "collision/ccd.hpp"\n',
         "contact/zone.cpp": '#include "zone.hpp"\n',
         "step.cpp": '#include "contact/zone.hpp"\n#include "dynamics/solve.hpp"\n',
+        "step.hpp": '#include "model/model.hpp"\n',
+        "step_backward.cpp": '#include "step.hpp"\n',
+        "rollout.hpp": '#include "step.hpp"\n',
+        "rollout.cpp": '#include "rollout.hpp"\n#include "math/rotation.hpp"\n',
         "bindings/bind_contact.cpp": '#include <pybind11/pybind11.h>\n#include "contact/zone.hpp"\n',
+        "bindings/bind_rollout.cpp": '#include <pybind11/pybind11.h>\n#include "rollout.hpp"\n',
     }.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -89,8 +96,11 @@ def test_allowed_includes_pass(tree: Path) -> None:
         ("collision/a.cpp", "  # include <model/model.hpp>", "collision may not include model/model.hpp"),
         ("contact/a.cpp", '#include "../dynamics/solve.hpp"', "contact may not include ../dynamics/solve.hpp"),
         ("dynamics/a.cpp", '#include "collision/ccd.hpp"', "dynamics may not include collision/ccd.hpp"),
+        ("geometry/a.hpp", '#include "model/model.hpp"', "geometry may not include model/model.hpp"),
+        ("step.hpp", '#include "rollout.hpp"', "step may not include rollout.hpp"),
         ("step.hpp", '#include "bindings/bind_contact.cpp"', "step may not include bindings/bind_contact.cpp"),
-        ("step.hpp", "#include <pybind11/numpy.h>", "only bindings may include pybind11/numpy.h"),
+        ("rollout.cpp", '#include "bindings/bind_rollout.cpp"', "rollout may not include bindings/bind_rollout.cpp"),
+        ("rollout.hpp", "#include <pybind11/numpy.h>", "only bindings may include pybind11/numpy.h"),
         ("math/a.hpp", '#include "missing.hpp"', "missing.hpp does not exist"),
         ("shortcut/a.hpp", "", "shortcut is not a room"),
     ],

@@ -1,0 +1,177 @@
+"""Falling cubes: N unit cubes, 2 m apart, dropped 0.5 m on a plane; 2 s in steps of 0.01 s, one thread.
+
+Beside MuJoCo's forward in the same run, in turns, with default options and both kinds of friction cones; its steps are
+looped over in C, by the faster of `mj_step(nstep=...)` and `mujoco.rollout`. Ours goes through `Simulator.rollout`:
+forward alone (no gradients recorded), and forward + backward (gradient of a loss on the final state with respect to the
+initial state and the masses). Prints one CSV line per N, medians over rounds, and the log-log slopes; should be at most
+1.0 (forward / MuJoCo), 2.0 (forward + backward / MuJoCo), 1.05 (slopes), 2000 bytes of tape per cube and step.
+
+Also: the peak of memory added by building and forward + backward, and by building and forward in MuJoCo; the gap that
+cubes at rest keep from the plane. MuJoCo's cubes have friction and soft contacts; ours are frictionless for now, and
+stiff. Needs the extra `bench`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from typing import Any, ClassVar
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import torch
+from _common import added_memory, in_turns, median_ratio, print_header, print_row, slope
+
+import diffsim as ds
+from diffsim import _core, scenes
+from diffsim.ops import RolloutCall, rollout
+
+COUNTS = (20, 100, 200, 300, 1000)
+DT, STEPS = 0.01, 200
+DROP, STRIDE, DENSITY = 0.5, 2.0, 1000.0
+CONES = ("pyramidal", "elliptic")
+TIMES = ("forward_s", "forward_backward_s", "mujoco_pyramidal_s", "mujoco_elliptic_s")
+RATIOS = tuple(f"{ours}_to_{cone}" for ours in ("forward", "forward_backward") for cone in CONES)
+COLUMNS = ("cubes", "steps", *TIMES, *RATIOS)
+COLUMNS += ("tape_bytes_per_cube_step", "memory_mb", "mujoco_memory_mb", "rest_gap_m")
+
+
+def differentiate(sim: ds.Simulator, start: ds.State) -> tuple[torch.Tensor, ...]:
+    fields = (start.position, start.orientation, start.velocity, start.angular_velocity)
+    inputs = [t.detach().requires_grad_() for t in fields]
+    final = sim.rollout(ds.State(*inputs), None, STEPS)[-1]
+    loss = final.position.square().sum() + final.orientation.square().sum()
+    loss = loss + final.velocity.square().sum() + final.angular_velocity.square().sum()
+    return torch.autograd.grad(loss, [*inputs, sim.mass])
+
+
+def advance(sim: ds.Simulator, start: ds.State) -> ds.State:
+    with torch.no_grad():
+        return sim.rollout(start, None, STEPS)
+
+
+def tape_bytes(sim: ds.Simulator, start: ds.State) -> int:
+    """Of the whole rollout; not public, so asked of the operator."""
+    call = RolloutCall(sim._model, sim._options, STEPS, 1, keep_time=True)
+    inputs = [start.position, start.orientation, start.velocity, start.angular_velocity]
+    rollout(call, *inputs, None, None, None, None, sim.mass, sim.inertia, sim.gravity)
+    assert isinstance(call.tape, _core.Tape)
+    return call.tape.nbytes
+
+
+def mujoco_model(count: int, cone: str) -> Any:
+    """The scene of `scenes.falling_cubes`, its positions included."""
+    side = int(np.ceil(np.sqrt(count)))
+    bodies = [
+        f'<body pos="{STRIDE * (k % side)} {STRIDE * (k // side)} {DROP + 0.5}"><freejoint/>'
+        f'<geom type="box" size=".5 .5 .5" density="{DENSITY}"/></body>'
+        for k in range(count)
+    ]
+    text = f"""<mujoco><option timestep="{DT}" cone="{cone}"/><worldbody>
+        <geom type="plane" size="0 0 1"/>{"".join(bodies)}</worldbody></mujoco>"""
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def mujoco_runs(model: Any) -> dict[str, Callable[[], object]]:
+    """Two ways to take the same steps in C from the same start."""
+    data = mujoco.MjData(model)
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+
+    def by_mj_step() -> object:
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_step(model, data, nstep=STEPS)
+        return data
+
+    def by_rollout() -> object:
+        return mujoco.rollout.rollout(model, data, state, nstep=STEPS)
+
+    return {"mj_step": by_mj_step, "rollout": by_rollout}
+
+
+class Worker:
+    """One number of cubes, in a process of its own."""
+
+    cases: ClassVar[dict[str, Callable[[], object]]] = {}
+
+    @classmethod
+    def prepare(cls, count: int) -> dict[str, float]:
+        """Build all scenes and run each once. Returns the columns that are not times."""
+        torch.set_num_threads(1)
+        made: dict[str, Any] = {}
+
+        def make_and_differentiate() -> None:
+            scene = scenes.falling_cubes(count, drop=DROP, stride=STRIDE, density=DENSITY)
+            made["sim"] = ds.Simulator(scene, dt=DT, num_threads=1, on_failure="raise")
+            made["sim"].mass.requires_grad_()
+            made["start"] = made["sim"].initial_state()
+            differentiate(made["sim"], made["start"])
+
+        facts = {
+            "memory_mb": added_memory(make_and_differentiate),
+            "mujoco_memory_mb": added_memory(lambda: mujoco_runs(mujoco_model(count, CONES[0]))["mj_step"]()),
+        }
+        sim, start = made["sim"], made["start"]
+        facts["rest_gap_m"] = float((advance(sim, start).position[-1, :, 2] - 0.5).abs().max())
+        facts["tape_bytes_per_cube_step"] = tape_bytes(sim, start) / (count * STEPS)
+        cls.cases = {"forward": partial(advance, sim, start), "forward_backward": partial(differentiate, sim, start)}
+        for cone in CONES:
+            for name, run in mujoco_runs(mujoco_model(count, cone)).items():
+                cls.cases[f"mujoco_{cone} {name}"] = run
+        for call in cls.cases.values():
+            call()
+        return facts
+
+    @classmethod
+    def measure(cls, clock: Callable[[], float]) -> dict[str, float]:
+        """Seconds each case takes."""
+        return {name: values[0] for name, values in in_turns(cls.cases, 1, clock).items()}
+
+
+def row_of(count: int, facts: dict[str, float], rounds: list[dict[str, float]]) -> dict[str, float]:
+    seconds = {name: [measured[name] for measured in rounds] for name in rounds[0]}
+    for cone in CONES:
+        ways = [values for name, values in seconds.items() if name.startswith(f"mujoco_{cone} ")]
+        seconds[f"mujoco_{cone}"] = min(ways, key=statistics.median)
+    row = {"cubes": count, "steps": STEPS, **facts}
+    row.update({f"{name}_s": statistics.median(values) for name, values in seconds.items()})
+    for ours in ("forward", "forward_backward"):
+        row.update({f"{ours}_to_{cone}": median_ratio(seconds[ours], seconds[f"mujoco_{cone}"]) for cone in CONES})
+    return row
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
+    parser.add_argument("--rounds", type=int, default=11, help="of which the medians are printed")
+    parser.add_argument("--cpu-time", action="store_true", help="time on the processor instead of wall time")
+    options = parser.parse_args()
+    clock = time.process_time if options.cpu_time else time.perf_counter
+    print_header("mujoco")
+    print_row(COLUMNS)
+    rounds: dict[int, list[dict[str, float]]] = {count: [] for count in options.counts}
+    with ExitStack() as stack:
+        spawn = multiprocessing.get_context("spawn")
+        workers = {count: stack.enter_context(ProcessPoolExecutor(1, spawn)) for count in options.counts}
+        facts = {count: worker.submit(Worker.prepare, count).result() for count, worker in workers.items()}
+        for _ in range(options.rounds):  # the numbers of cubes take turns, too, for the sake of the slopes
+            for count, worker in workers.items():
+                rounds[count].append(worker.submit(Worker.measure, clock).result())
+    rows = [row_of(count, facts[count], rounds[count]) for count in options.counts]
+    for row in rows:
+        print_row(row[name] for name in COLUMNS)
+    slopes = (f"{name} {slope([row['cubes'] for row in rows], [row[name] for row in rows]):.3f}" for name in TIMES)
+    print("# log-log slopes:", ", ".join(slopes))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,262 @@
+"""What goes wrong must not hurt: squeezes, steps that give up, bad input, long use, random scenes."""
+
+from __future__ import annotations
+
+import math
+import resource
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from penetration import PenetrationCheck
+
+import diffsim as ds
+from diffsim import scenes
+
+STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
+FUZZ = Path(__file__).parent.parent / "fuzz.py"
+STATM = Path("/proc/self/statm")
+
+
+def test_random_scenes() -> None:
+    """A few of the scenes of the fuzz script, which can run longer."""
+    command = [sys.executable, str(FUZZ), "--scenes", "3", "--steps", "200", "--first", "4"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    assert "3 scenes of 10 bodies and 200 steps" in found.stdout
+    assert ": 0 scenes with problems" in found.stdout
+
+
+# ---- squeezes --------------------------------------------------------------------------------------------------------
+
+
+def squeeze() -> ds.Scene:
+    """A plate above a cube on the ground; PRESS drives it down, further than there is room."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(ds.shapes.box(0.5), density=1000.0, position=(0, 0, 0.251), name="cube")
+    scene.add_body(ds.shapes.box((2, 2, 0.2)), kind="kinematic", position=(0.1, 0.05, 0.65), name="press")
+    return scene
+
+
+def driven(speed: float) -> ds.Control:
+    return ds.Control(body_velocity=torch.tensor([[0.0, 0, 0], [0, 0, speed]], dtype=torch.float64))
+
+
+PRESS = driven(-0.5)
+
+
+def assert_finite(state: ds.State) -> None:
+    for name in STATE_FIELDS:
+        assert bool(getattr(state, name).isfinite().all()), name
+
+
+def assert_no_penetration(scene: ds.Scene, sim: ds.Simulator, trajectory: ds.State) -> None:
+    check = PenetrationCheck(scene, sim.thickness)
+    for step, frame in enumerate(trajectory):
+        assert check.problems(sim, frame) == [], step
+
+
+def test_a_long_squeeze_is_survived_and_told() -> None:
+    scene = squeeze()
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    with pytest.warns(ds.ConvergenceWarning, match="did not converge") as caught:
+        trajectory = sim.rollout(state, PRESS, 60)
+    assert len(caught) == 1
+    assert sim.info is not None
+    assert not sim.info.converged
+    assert sim.info.failed_steps >= 40
+    assert_finite(trajectory)
+    assert_no_penetration(scene, sim, trajectory)
+    # The press has gone as far as there was room, but for a step that it could not finish; the cube has stayed.
+    height = trajectory.position[-1, 1, 2] - 0.1
+    assert 0.5 < float(height) < 0.5 + 3 * sim.thickness + 0.5 * sim.dt
+    assert float((trajectory.position[-1, 0, :2]).norm()) < 0.01
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # told once
+        sim.rollout(trajectory[-1], PRESS, 3)
+    assert not sim.info.converged
+
+
+def test_a_squeeze_ends_when_the_press_goes_back() -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    with pytest.warns(ds.ConvergenceWarning):
+        squeezed = sim.rollout(sim.initial_state(), PRESS, 25)[-1]
+    released = sim.rollout(squeezed, driven(0.5), 40)
+    assert sim.info is not None
+    assert sim.info.converged
+    assert float(released.position[-1, 1, 2] - squeezed.position[1, 2]) == pytest.approx(0.2, rel=1e-9)
+    assert float(released.position[-1, 0, 2]) == pytest.approx(0.25, abs=2 * sim.thickness)
+    assert float(released.velocity[-1, 0].norm()) < 1e-3
+
+
+def test_gradients_through_a_squeeze_are_finite() -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state()
+    leaves = [getattr(state, name).requires_grad_() for name in STATE_FIELDS]
+    parameters = [p.requires_grad_() for p in (sim.mass, sim.inertia, sim.gravity)]
+    with pytest.warns(ds.ConvergenceWarning):
+        trajectory = sim.rollout(state, PRESS, 25)
+    found = torch.autograd.grad(trajectory.position.sum() + trajectory.velocity.sum(), leaves + parameters)
+    assert all(bool(g.isfinite().all()) for g in found)
+    assert found[0].any()
+
+
+def test_a_squeeze_raises_if_asked_to() -> None:
+    scene = squeeze()
+    sim = ds.Simulator(scene, dt=0.01, on_failure="raise")
+    with pytest.raises(ds.SolverError, match="did not converge") as caught:
+        sim.rollout(sim.initial_state(), PRESS, 25)
+    error = caught.value
+    assert not error.info.converged
+    assert math.isfinite(error.residual)
+    assert_finite(error.state)
+    assert_no_penetration(scene, sim, error.state)
+
+
+def test_a_slow_enough_press_does_what_it_can() -> None:
+    """The press stops within its reach: no squeeze, no failure."""
+    sim = ds.Simulator(squeeze(), dt=0.01, on_failure="raise")
+    end = sim.rollout(sim.initial_state(), driven(-0.04), 100)[-1]
+    assert float(end.position[1, 2]) == pytest.approx(0.61, abs=1e-9)
+
+
+# ---- giving up early -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [scenes.tilted_box, scenes.nonconvex_pair, scenes.kinematic_pusher])
+def test_one_iteration_is_safe(make: Any) -> None:
+    scene = make()
+    sim = ds.Simulator(scene, dt=0.01, max_iterations=1)
+    state = sim.initial_state()
+    state.velocity.requires_grad_()
+    with pytest.warns(ds.ConvergenceWarning, match="did not converge") as caught:
+        trajectory = sim.rollout(state, None, 80)
+    assert len(caught) == 1
+    assert sim.info is not None
+    assert not sim.info.converged
+    assert_finite(trajectory)
+    assert_no_penetration(scene, sim, trajectory.detach())
+    (gradient,) = torch.autograd.grad(trajectory.position[-1].sum(), state.velocity)
+    assert gradient.any()
+    assert bool(gradient.isfinite().all())
+
+
+def test_a_batch_fails_scene_by_scene() -> None:
+    """One scene that cannot converge neither spoils the others nor hides among them."""
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state(batch=3)
+    assert PRESS.body_velocity is not None
+    velocity = PRESS.body_velocity * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)[:, None, None]
+    with pytest.warns(ds.ConvergenceWarning):
+        trajectory = sim.rollout(state, ds.Control(body_velocity=velocity), 25)
+    assert bool((trajectory.position[-1, 1] != trajectory.position[-1, 0]).any())
+    alone = sim.rollout(state[0], driven(0.0), 25)
+    assert sim.info is not None
+    assert sim.info.converged
+    for name in STATE_FIELDS:
+        assert torch.equal(getattr(trajectory, name)[:, 0], getattr(alone, name))
+        assert torch.equal(getattr(trajectory, name)[:, 2], getattr(alone, name))
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth", [0.0, 1e-3, 0.05, 0.25])
+def test_states_in_the_ground_are_refused_by_name(depth: float) -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state()
+    position = state.position.clone()
+    position[0, 2] = 0.25 - depth
+    with pytest.raises(ValueError, match=r"'cube'.*ground|ground.*'cube'"):
+        sim(state.replace(position=position))
+
+
+@pytest.mark.xfail(strict=True, reason="a state made by hand is not searched for meshes that cross, only a scene is")
+@pytest.mark.parametrize("depth", [1e-4, 1e-3, 0.05])
+def test_states_in_each_other_are_refused_by_name(depth: float) -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state()
+    position = state.position.clone()
+    position[1, 2] = position[0, 2] + 0.35 - depth
+    with pytest.raises(ValueError, match=r"'cube'.*'press'|'press'.*'cube'"):
+        sim(state.replace(position=position))
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value", "text"),
+    [
+        ("mass", 0.0, r"mass.*'cube'|'cube'.*mass"),
+        ("mass", -1.0, r"mass.*'cube'|'cube'.*mass"),
+        ("mass", math.nan, r"mass.*'cube'|'cube'.*mass"),
+        ("inertia", -1.0, r"inertia.*'cube'|'cube'.*inertia"),
+        ("inertia", math.inf, r"inertia.*'cube'|'cube'.*inertia"),
+        ("gravity", math.nan, "gravity"),
+    ],
+)
+def test_bad_parameters_are_refused_by_name(parameter: str, value: float, text: str) -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state()
+    with torch.no_grad():
+        getattr(sim, parameter)[0] *= value if value else 0.0
+    with pytest.raises(ValueError, match=text):
+        sim(state)
+
+
+def test_a_quaternion_that_is_none_is_refused_by_name() -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state()
+    with pytest.raises(ValueError, match=r"orientation.*'cube'|'cube'.*orientation"):
+        sim(state.replace(orientation=1.1 * state.orientation))
+    with pytest.raises(ValueError, match=r"orientation.*'cube'|'cube'.*orientation"):
+        sim(state.replace(orientation=0.0 * state.orientation))
+
+
+@pytest.mark.parametrize("name", ["velocity", "angular_velocity"])
+def test_absurd_speeds_are_answered(name: str) -> None:
+    """Either a step or an error that says what is wrong; never NaN, never a hang."""
+    scene = scenes.tilted_box()
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    for size in (1e5, 1e8, 1e12):
+        fast = state.replace(**{name: size * torch.tensor([[0.3, 0.2, -1.0]], dtype=torch.float64)})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ds.ConvergenceWarning)
+            try:
+                end = sim(fast)
+            except ValueError as error:
+                assert name in str(error)  # noqa: PT017  # either is fine
+                continue
+        assert_finite(end)
+        assert PenetrationCheck(scene, sim.thickness).problems(sim, end) == []
+
+
+# ---- long use --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
+def test_memory_is_flat_over_two_thousand_rollouts() -> None:
+    sim = ds.Simulator(scenes.tilted_box(height=0.75), dt=0.01)
+    state = sim.initial_state(batch=2)
+    control = ds.Control(force=torch.ones(1, 3, dtype=torch.float64))
+
+    def resident_bytes() -> int:
+        return int(STATM.read_text().split()[1]) * resource.getpagesize()
+
+    def roll(count: int) -> None:
+        for index in range(count):
+            velocity = state.velocity.clone().requires_grad_()
+            every = (None, 4)[index % 2]
+            end = sim.rollout(state.replace(velocity=velocity), control, 10, every)[-1]
+            if index % 3:  # sometimes no backward follows
+                end.position.sum().backward()
+
+    roll(300)
+    before = resident_bytes()
+    roll(2000)
+    assert resident_bytes() - before < 2000 * 500  # a leaked tape, state or array is more than 500 bytes
