@@ -1,0 +1,254 @@
+#include "contact/adjoint.hpp"
+
+#include <Eigen/LU>
+
+#include "contact/zone_solver.hpp"
+#include "fixtures.hpp"
+
+using namespace diffsim;
+using fixtures::dense;
+using fixtures::flatten;
+using fixtures::unflatten;
+
+namespace {
+
+constexpr double kThickness = 1e-3;  // [m]
+constexpr double kDt = 0.01;         // [s]
+// Two ways to solve the same linear system, of condition 1 / compliance times some.
+constexpr double kSameSystem = 1e-9;
+// Differences over kStep of solutions that are good to about 1e-13 m.
+constexpr double kDifferences = 1e-6;
+constexpr double kStep = 2e-6;
+
+/// Bodies at rest or landing, and how they are solved.
+struct Scene {
+    Model model;
+    std::vector<ZoneBody> bodies;
+    PassiveBodies passive;
+    double compliance = 1e-4;
+
+    int add(const Vec3& half, const Pose& start, double mass) {
+        const int id = model.body_count();
+        model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
+        bodies.push_back(fixtures::zone_body(id, start, mass, fixtures::box_inertia(half, mass)));
+        bodies.back().target.tail<3>() = kDt * kDt * Vec3(0.3, -0.2, -9.81) * 30.0;  // pressed and pushed sideways
+        bodies.back().target.head<3>() = 1e-3 * Vec3(0.4, 0.3, 0.2);
+        return id;
+    }
+    /// A body that does not yield.
+    void add_static(const Vec3& half, const Pose& start) {
+        const int id = model.body_count();
+        model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness, BodyKind::static_));
+        passive.bodies.push_back({id, start, Vec6::Zero()});
+        plant_tree();
+    }
+    void plant_tree() {
+        std::vector<Box> boxes;
+        for (const PassiveBody& body : passive.bodies)
+            boxes.push_back(swept_box({&model.bodies[body.id].mesh, {body.start, body.start}, 0.1}));
+        passive.tree = build_box_tree(boxes);
+    }
+    Zone zone() const {
+        Zone result;
+        result.model = &model;
+        result.compliance = compliance;
+        result.ground_height = model.ground.height;
+        result.bodies = bodies;
+        result.dynamic_count = static_cast<int>(bodies.size());
+        return result;
+    }
+    /// The zone at its solution, with its active contacts only.
+    Zone solve(ZonePoint& point) const {
+        Zone result = zone();
+        ZoneWorkspace workspace;
+        std::vector<Box> visited;
+        const ZoneResult outcome = solve_zone(result, passive, ZoneOptions(), workspace, visited);
+        CHECK(outcome.status == ZoneStatus::converged);
+        std::vector<ZoneContact> active;
+        for (const ActiveContact& a : workspace.point.active) active.push_back(result.contacts[a.index]);
+        result.contacts = active;
+        point.y = workspace.point.y;
+        evaluate(result, point);
+        return result;
+    }
+    VectorX solution() const {
+        ZonePoint point;
+        const Zone solved = solve(point);
+        point.y.resize(static_cast<std::size_t>(solved.dynamic_count));
+        return flatten(point.y);
+    }
+};
+
+/// Two boxes on the ground, a box that bridges them, and one on top: many more contact rows than they can be independent.
+Scene stack() {
+    Scene scene;
+    scene.model.thickness = kThickness;
+    scene.model.ground = {true, 0.0, 0.5 * kThickness};
+    const double gap = 0.97 * kThickness;  // pressed together a little
+    const Mat3 turned = exp_rotation(Vec3(0, 0, 0.2));
+    scene.add(Vec3(0.1, 0.1, 0.1), {Mat3::Identity(), Vec3(-0.25, 0.02, 0.1 + gap)}, 8.0);
+    scene.add(Vec3(0.1, 0.1, 0.1), {turned, Vec3(0.25, 0, 0.1 + gap)}, 6.0);
+    scene.add(Vec3(0.5, 0.3, 0.05), {Mat3::Identity(), Vec3(0, 0, 0.25 + 2.0 * gap)}, 20.0);
+    scene.add(Vec3(0.2, 0.2, 0.1), {turned, Vec3(0.05, 0.01, 0.4 + 3.0 * gap)}, 10.0);
+    return scene;
+}
+
+/// A tilted box that comes down on the ground and against a block that stands there.
+Scene landing() {
+    Scene scene;
+    scene.model.thickness = kThickness;
+    scene.model.ground = {true, 0.0, 0.5 * kThickness};
+    scene.add_static(Vec3(0.1, 0.5, 0.3), {exp_rotation(Vec3(0, 0, 0.1)), Vec3(0.37, 0, 0.3)});
+    const Mat3 R = exp_rotation(Vec3(0.1, 0.2, 0.1));
+    scene.add(Vec3(0.2, 0.15, 0.1), {R, Vec3(0, 0, 0.17)}, 5.0);
+    scene.bodies[0].target << 0.05, -0.3, 0.1, 0.08, 0.01, -0.05;
+    return scene;
+}
+
+Coordinates random_upstream(const Zone& zone, std::uint64_t seed) {
+    return unflatten(check::Random(seed).vector(6 * zone.dynamic_count));
+}
+
+VectorX multiplier(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode) {
+    BlockSystem system;
+    return flatten(zone_adjoint(zone, point, upstream, mode, system).multiplier);
+}
+
+void check_same_system(const Zone& zone, const ZonePoint& point) {
+    for (const std::uint64_t seed : {1, 2, 3}) {
+        const Coordinates upstream = random_upstream(zone, seed);
+        const VectorX by_lu = multiplier(zone, point, upstream, AdjointMode::dense);
+        const VectorX by_qr = multiplier(zone, point, upstream, AdjointMode::qr);
+        BlockSystem system;
+        ZoneDerivatives derivatives;
+        system.set_pattern(zone.dynamic_count, zone.pairs);
+        differentiate(zone, point, Curvature::dropped, derivatives, &system);
+        const VectorX direct = dense(system).ldlt().solve(flatten(upstream));
+        CHECK(by_lu.norm() > 0.0);
+        CHECK_NEAR(by_qr, by_lu, kSameSystem * by_lu.norm());
+        CHECK_NEAR(direct, by_lu, kSameSystem * by_lu.norm());
+    }
+}
+
+}  // namespace
+
+TEST(dense_and_qr_solve_the_same_system_on_redundant_rows) {
+    ZonePoint point;
+    const Scene scene = stack();
+    Zone zone = scene.solve(point);
+    CHECK(zone.dynamic_count == 4);
+    CHECK(point.active.size() >= 20);  // of 24 unknowns, 8 of them free to slide or turn on the spot
+    check_same_system(zone, point);
+
+    // Every row many times over.
+    const std::vector<ZoneContact> once = zone.contacts;
+    for (int copy = 0; copy < 4; ++copy) zone.contacts.insert(zone.contacts.end(), once.begin(), once.end());
+    evaluate(zone, point);
+    CHECK(point.active.size() >= 100);
+    check_same_system(zone, point);
+}
+
+TEST(dense_and_qr_solve_the_same_system_on_turned_coordinates) {
+    ZonePoint point;
+    const Scene scene = landing();
+    const Zone zone = scene.solve(point);
+    CHECK(point.active.size() >= 2);
+    CHECK(point.y[0].head<3>().norm() > 0.05);
+    check_same_system(zone, point);
+}
+
+TEST(dense_and_qr_do_without_contacts) {
+    ZonePoint point;
+    const Scene scene = stack();
+    Zone zone = scene.solve(point);
+    zone.contacts.clear();
+    zone.pairs.clear();
+    evaluate(zone, point);
+    CHECK(point.active.empty());
+    check_same_system(zone, point);
+}
+
+TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
+    for (const bool is_stack : {true, false}) {
+        NOTE(is_stack);
+        const Scene scene = is_stack ? stack() : landing();
+        ZonePoint point;
+        const Zone zone = scene.solve(point);
+        const std::size_t count = scene.bodies.size();
+        const Coordinates upstream = random_upstream(zone, 5);
+        BlockSystem system;
+        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, system);
+        const auto loss = [&](const Scene& changed) { return flatten(upstream).dot(changed.solution()); };
+
+        // d(loss)/d(target) = M z
+        for (std::size_t i = 0; i < count; ++i) {
+            NOTE(i);
+            const ZoneBody& body = scene.bodies[i];
+            const Vec6& z = adjoint.multiplier[i];
+            Vec6 by_target, by_start;
+            by_target << body.inertia * z.head<3>(), body.mass * z.tail<3>();
+            const auto targeted = [&](const VectorX& x) {
+                Scene changed = scene;
+                changed.bodies[i].target += x;
+                return loss(changed);
+            };
+            CHECK(by_target.norm() > 1e-2);
+            CHECK_NEAR(by_target, fixtures::numeric_gradient(targeted, VectorX::Zero(6), kStep), kDifferences);
+
+            // The base pose moves, targets and inertia stay: a turn arrives at the end of the step turned by Exp(theta).
+            const Vec6& pose = adjoint.pose_gradient[i];
+            by_start << exp_rotation(point.y[i].head<3>()).transpose() * pose.head<3>(), pose.tail<3>();
+            const auto started = [&](const VectorX& x) {
+                Scene changed = scene;
+                changed.bodies[i].start.R = exp_rotation(Vec3(x.head<3>())) * body.start.R;
+                changed.bodies[i].start.t += x.tail<3>();
+                return loss(changed);
+            };
+            const VectorX numeric = fixtures::numeric_gradient(started, VectorX::Zero(6), kStep);
+            CHECK(by_start.norm() > 1e-2);
+            CHECK_NEAR(by_start, numeric, 10.0 * kDifferences * (1.0 + by_start.norm()));
+
+            // The mass, through the contacts' stiffness and through the inertial term.
+            const double by_mass = adjoint.mass_gradient[i] - z.tail<3>().dot((point.y[i] - body.target).tail<3>());
+            const auto weighed = [&](const VectorX& x) {
+                Scene changed = scene;
+                changed.bodies[i].mass += x[0];
+                return loss(changed);
+            };
+            const double heavier = fixtures::numeric_gradient(weighed, VectorX::Zero(1), 1e-3 * body.mass)[0];
+            CHECK(std::abs(by_mass) > 1e-7);
+            CHECK_NEAR(by_mass, heavier, 1e-4 * std::abs(by_mass) + 1e-9);
+        }
+    }
+}
+
+TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
+    const Scene scene = landing();
+    ZonePoint point;
+    const Zone zone = scene.solve(point);
+    CHECK(zone.body_count() == 2);
+    const Coordinates upstream = random_upstream(zone, 6);
+    BlockSystem system;
+    const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, system);
+    const auto moved = [&](const VectorX& x) {
+        Scene changed = scene;
+        Pose& start = changed.passive.bodies[0].start;
+        start = {exp_rotation(Vec3(x.head<3>())) * start.R, start.t + x.tail<3>()};
+        changed.plant_tree();
+        return flatten(upstream).dot(changed.solution());
+    };
+    const Vec6& analytic = adjoint.pose_gradient[1];
+    CHECK(analytic.tail<3>().norm() > 1e-2);
+    CHECK_NEAR(
+        analytic, fixtures::numeric_gradient(moved, VectorX::Zero(6), kStep), 10.0 * kDifferences * analytic.norm());
+}
+
+TEST(modes_differ_where_contacts_turn) {
+    ZonePoint point;
+    const Scene scene = landing();
+    const Zone zone = scene.solve(point);
+    const Coordinates upstream = random_upstream(zone, 7);
+    const VectorX exact = multiplier(zone, point, upstream, AdjointMode::exact);
+    const VectorX linear = multiplier(zone, point, upstream, AdjointMode::dense);
+    CHECK((exact - linear).norm() > 1e-4 * exact.norm());
+}

@@ -1,0 +1,106 @@
+#include "contact/block_system.hpp"
+
+#include <Eigen/Cholesky>
+#include <utility>
+
+#include "fixtures.hpp"
+
+using namespace diffsim;
+using Pairs = std::vector<std::pair<int, int>>;
+
+namespace {
+
+constexpr double kRounding = 1e-11;  // condition numbers below 1e3, 240 unknowns
+
+/// A chain with some longer links, as the contact graph of a pile has.
+Pairs random_pairs(check::Random& random, int count) {
+    Pairs pairs;
+    for (int i = 0; i < count; ++i)
+        for (int j = i + 1; j < count; ++j)
+            if (j == i + 1 || random.uniform(0.0, 1.0) < 3.0 / count) pairs.emplace_back(i, j);
+    return pairs;
+}
+
+/// Σ over pairs of a random 12x12 Gram matrix, plus the identity.
+void fill(BlockSystem& system, check::Random& random) {
+    system.set_zero();
+    for (int i = 0; i < system.body_count(); ++i) system.diagonal(i) = Mat6::Identity();
+    for (std::size_t k = 0; k < system.pairs().size(); ++k) {
+        const auto [i, j] = system.pairs()[k];
+        const MatrixX rows = random.matrix(12, 12), gram = rows * rows.transpose();
+        system.diagonal(i) += gram.topLeftCorner<6, 6>();
+        system.diagonal(j) += gram.bottomRightCorner<6, 6>();
+        system.off_diagonal(static_cast<int>(k)) += gram.topRightCorner<6, 6>();
+    }
+}
+
+void check_solution(BlockSystem& system, check::Random& random) {
+    const MatrixX matrix = fixtures::dense(system);
+    const VectorX rhs = random.vector(matrix.rows());
+    CHECK(system.factorize());
+    Coordinates x = fixtures::unflatten(rhs), product;
+    system.multiply(x, product);
+    CHECK_NEAR(fixtures::flatten(product), matrix * rhs, kRounding * matrix.norm());
+    system.solve_in_place(x);
+    CHECK_NEAR(fixtures::flatten(x), matrix.ldlt().solve(rhs), kRounding);
+    CHECK_NEAR(matrix * fixtures::flatten(x), rhs, kRounding * matrix.norm());
+}
+
+}  // namespace
+
+TEST(block_system_agrees_with_a_dense_matrix) {
+    check::Random random(1);
+    for (const int count : {1, 2, 3, 8, 9, 40}) {
+        NOTE(count);
+        BlockSystem system;
+        system.set_pattern(count, random_pairs(random, count));
+        fill(system, random);
+        check_solution(system, random);
+        fill(system, random);  // the same pattern, other numbers
+        check_solution(system, random);
+    }
+}
+
+TEST(block_system_can_change_its_pattern) {
+    check::Random random(2);
+    BlockSystem system;
+    for (const int count : {40, 3, 12, 1, 12, 40}) {
+        NOTE(count);
+        system.set_pattern(count, random_pairs(random, count));
+        fill(system, random);
+        check_solution(system, random);
+    }
+    system.set_pattern(40, {{0, 39}});  // as many bodies, other pairs
+    fill(system, random);
+    check_solution(system, random);
+    BlockSystem moved = std::move(system);
+    check_solution(moved, random);
+}
+
+TEST(block_system_without_pairs) {
+    check::Random random(3);
+    for (const int count : {1, 5, 20}) {
+        BlockSystem system;
+        system.set_pattern(count, {});
+        fill(system, random);
+        for (int i = 0; i < count; ++i) system.diagonal(i) *= 1.0 + i;
+        Coordinates x(static_cast<std::size_t>(count), Vec6::Ones());
+        CHECK(system.factorize());
+        system.solve_in_place(x);
+        for (int i = 0; i < count; ++i) CHECK_NEAR(x[i], Vec6::Constant(1.0 / (1.0 + i)), 1e-15);
+    }
+}
+
+TEST(block_system_refuses_what_is_not_positive_definite) {
+    check::Random random(4);
+    for (const int count : {1, 3, 8, 9, 40}) {
+        NOTE(count);
+        BlockSystem system;
+        system.set_pattern(count, random_pairs(random, count));
+        fill(system, random);
+        system.diagonal(count - 1)(5, 5) = -1.0;
+        CHECK(!system.factorize());
+        fill(system, random);
+        CHECK(system.factorize());
+    }
+}

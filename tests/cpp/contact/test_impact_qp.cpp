@@ -1,0 +1,196 @@
+#include "contact/impact_qp.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "fixtures.hpp"
+
+using namespace diffsim;
+using fixtures::flatten;
+using fixtures::random_direction;
+
+namespace {
+
+// The solver stops when the gradient has fallen to 1e-9 of where it began.
+constexpr double kOptimality = 1.01e-9;
+
+struct Problem {
+    Zone zone;
+    Coordinates inertial_gradient;
+    std::vector<double> mass_factor;
+    std::vector<ImpactRow> rows;
+
+    Eigen::Index size() const { return 6 * zone.dynamic_count; }
+    MatrixX mass() const {
+        MatrixX M = MatrixX::Zero(size(), size());
+        for (int i = 0; i < zone.dynamic_count; ++i) {
+            const ZoneBody& body = zone.bodies[i];
+            M.block<3, 3>(6 * i, 6 * i) = mass_factor[i] * body.inertia;
+            M.block<3, 3>(6 * i + 3, 6 * i + 3) = mass_factor[i] * body.mass * Mat3::Identity();
+        }
+        return M;
+    }
+    VectorX row(const ImpactRow& r) const {
+        VectorX full = VectorX::Zero(size());
+        if (r.a >= 0) full.segment<6>(6 * r.a) = r.row_a;
+        if (r.b >= 0) full.segment<6>(6 * r.b) = r.row_b;
+        return full;
+    }
+    VectorX gradient(const VectorX& p) const {
+        VectorX g = mass() * p + flatten(inertial_gradient);
+        for (const ImpactRow& r : rows) g -= r.stiffness * std::max(0.0, r.missing - row(r).dot(p)) * row(r);
+        return g;
+    }
+    double energy(const VectorX& p) const {
+        double e = 0.5 * p.dot(mass() * p) + flatten(inertial_gradient).dot(p);
+        for (const ImpactRow& r : rows) e += 0.5 * r.stiffness * std::pow(std::max(0.0, r.missing - row(r).dot(p)), 2);
+        return e;
+    }
+    int solve(Coordinates& p) const {
+        BlockSystem system;
+        system.set_pattern(zone.dynamic_count, zone.pairs);
+        return solve_impact_qp(zone, inertial_gradient, mass_factor, rows, system, p);
+    }
+    /// The dual, one multiplier at a time:  p = M⁻¹ (Σ λ r - g),  0 ≤ λ = stiffness · violation. Slow and plain.
+    VectorX reference(int sweeps) const {
+        const MatrixX inverse = mass().inverse();
+        std::vector<VectorX> full, push;
+        for (const ImpactRow& r : rows) {
+            full.push_back(row(r));
+            push.push_back(inverse * full.back());
+        }
+        VectorX p = -(inverse * flatten(inertial_gradient));
+        VectorX multipliers = VectorX::Zero(static_cast<Eigen::Index>(rows.size()));
+        for (int sweep = 0; sweep < sweeps; ++sweep)
+            for (std::size_t k = 0; k < rows.size(); ++k) {
+                double& multiplier = multipliers[static_cast<Eigen::Index>(k)];
+                const double softness = 1.0 / rows[k].stiffness;
+                const double residual = rows[k].missing - full[k].dot(p) - softness * multiplier;
+                const double next = std::max(0.0, multiplier + residual / (softness + full[k].dot(push[k])));
+                p += (next - multiplier) * push[k];
+                multiplier = next;
+            }
+        return p;
+    }
+};
+
+Problem random_problem(check::Random& random, int bodies, int row_count, double stiffness) {
+    Problem problem;
+    Zone& zone = problem.zone;
+    zone.dynamic_count = bodies;
+    for (int i = 0; i < bodies; ++i) {
+        const double mass = random.uniform(0.5, 5.0);
+        zone.bodies.push_back(fixtures::zone_body(i, Pose(), mass, mass * fixtures::random_inertia(random, 4.0)));
+        problem.inertial_gradient.push_back(random.vector(6));
+        problem.mass_factor.push_back(i % 2 == 0 ? 1.0 : 3.0);
+        for (int j = i + 1; j < bodies; ++j) zone.pairs.emplace_back(i, j);
+    }
+    for (int k = 0; k < row_count; ++k) {
+        ImpactRow row;
+        row.a = static_cast<int>(random.uniform(0.0, bodies));
+        row.b = static_cast<int>(random.uniform(0.0, bodies));
+        if (row.b == row.a) row.b = -1;
+        if (row.b >= 0 && row.a > row.b) std::swap(row.a, row.b);
+        if (row.b < 0 && k % 2 == 0) std::swap(row.a, row.b);  // the partner that does not yield may be either
+        const auto found = std::find(zone.pairs.begin(), zone.pairs.end(), std::pair(row.a, row.b));
+        row.pair = found == zone.pairs.end() ? -1 : static_cast<int>(found - zone.pairs.begin());
+        const Vec3 n = random_direction(random);
+        row.row_a << fixtures::random_vec3(random).cross(n), n;
+        row.row_b << fixtures::random_vec3(random).cross(-n), -n;
+        row.missing = random.uniform(-0.5, 0.5);
+        row.stiffness = stiffness * random.uniform(0.5, 2.0);
+        problem.rows.push_back(row);
+    }
+    return problem;
+}
+
+/// How many rows push at p.
+int active_rows(const Problem& problem, const VectorX& p) {
+    int count = 0;
+    for (const ImpactRow& r : problem.rows) count += problem.row(r).dot(p) < r.missing ? 1 : 0;
+    return count;
+}
+
+}  // namespace
+
+TEST(impact_qp_ends_where_the_gradient_vanishes) {
+    check::Random random(1);
+    int some_active = 0, some_not = 0;
+    for (const int bodies : {1, 2, 5, 12}) {
+        for (const int rows_per_body : {0, 1, 3, 8}) {
+            for (const double stiffness : {10.0, 1e4, 1e7}) {
+                NOTE(bodies);
+                NOTE(rows_per_body);
+                NOTE(stiffness);
+                const Problem problem = random_problem(random, bodies, bodies * rows_per_body, stiffness);
+                Coordinates p = fixtures::unflatten(random.vector(6 * bodies));
+                const double start = problem.gradient(flatten(p)).norm();
+                const int steps = problem.solve(p);
+                const VectorX g = problem.gradient(flatten(p));
+                // What rounding leaves at stiff rows: eps · stiffness · |p|.
+                const double noise = 1e-14 * stiffness * static_cast<double>(1 + problem.rows.size());
+                CHECK(steps >= 1);
+                CHECK(steps < 100);
+                CHECK(g.norm() <= kOptimality * start + noise);
+                const int active = active_rows(problem, flatten(p));
+                some_active += active > 0 ? 1 : 0;
+                some_not += active < static_cast<int>(problem.rows.size()) ? 1 : 0;
+            }
+        }
+    }
+    CHECK(some_active >= 20);
+    CHECK(some_not >= 20);
+}
+
+TEST(impact_qp_agrees_with_a_slow_reference) {
+    check::Random random(2);
+    int cases_hit = 0;
+    for (int k = 0; k < 20; ++k) {
+        NOTE(k);
+        const Problem problem = random_problem(random, 1 + k % 4, 3 + k % 7, 100.0);
+        Coordinates p(static_cast<std::size_t>(problem.zone.dynamic_count), Vec6::Zero());
+        problem.solve(p);
+        const VectorX found = flatten(p), reference = problem.reference(4000);
+        CHECK_NEAR(found, reference, 1e-7 * (1.0 + reference.norm()));  // what the solver's tolerance is worth in p
+        for (int trial = 0; trial < 10; ++trial)
+            CHECK(problem.energy(found + 1e-3 * random.vector(found.size())) > problem.energy(found));
+        cases_hit += active_rows(problem, found) >= 2 ? 1 : 0;
+    }
+    CHECK(cases_hit >= 10);
+}
+
+TEST(impact_qp_does_not_depend_on_the_start) {
+    check::Random random(3);
+    for (int k = 0; k < 10; ++k) {
+        NOTE(k);
+        const Problem problem = random_problem(random, 3, 10, 1e4);
+        Coordinates near(3, Vec6::Zero()), far = fixtures::unflatten(100.0 * random.vector(18));
+        problem.solve(near);
+        problem.solve(far);
+        CHECK(flatten(near).norm() > 1e-3);
+        CHECK_NEAR(flatten(far), flatten(near), 1e-5);  // 1e-9 of a gradient of about 1e6, over masses of about 1
+    }
+}
+
+TEST(without_rows_bodies_go_to_their_targets) {
+    check::Random random(4);
+    const Problem problem = random_problem(random, 2, 0, 1.0);
+    Coordinates p(2, Vec6::Zero());
+    problem.solve(p);
+    const VectorX expected = -(problem.mass().inverse() * flatten(problem.inertial_gradient));
+    CHECK_NEAR(flatten(p), expected, 1e-13);
+}
+
+TEST(a_row_that_wants_more_is_met_as_far_as_masses_and_stiffness_say) {
+    // One body of mass m pushed along z by one row through its centre: m p = k (missing - p).
+    Problem problem;
+    problem.zone.dynamic_count = 1;
+    problem.zone.bodies.push_back(fixtures::zone_body(0, Pose(), 2.0, Mat3::Identity()));
+    problem.inertial_gradient.assign(1, Vec6::Zero());
+    problem.mass_factor = {1.0};
+    ImpactRow row{0, -1, -1, Vec6::Unit(5), Vec6::Zero(), 0.3, 6.0};
+    problem.rows.push_back(row);
+    Coordinates p(1, Vec6::Zero());
+    problem.solve(p);
+    CHECK_NEAR(p[0], 0.3 * 6.0 / 8.0 * Vec6::Unit(5), 1e-14);
+}

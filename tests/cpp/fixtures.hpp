@@ -1,0 +1,175 @@
+// Meshes, bodies and numeric derivatives that the core's tests share.
+#pragma once
+
+#include <Eigen/Geometry>
+#include <cmath>
+#include <utility>
+#include <vector>
+
+#include "check.hpp"
+#include "contact/zone.hpp"
+#include "math/rotation.hpp"
+#include "model/model.hpp"
+
+namespace fixtures {
+
+using namespace diffsim;
+
+// --- random values -----------------------------------------------------------------------------------------------------
+
+inline Vec3 random_vec3(check::Random& random, double size = 1.0) { return random.vector(3, -size, size); }
+
+inline Vec3 random_direction(check::Random& random) {
+    Vec3 v;
+    do v = random_vec3(random);
+    while (v.norm() < 0.1 || v.norm() > 1.0);
+    return v.normalized();
+}
+
+inline Mat3 random_rotation(check::Random& random) {
+    return exp_rotation(random.uniform(0.0, 3.0) * random_direction(random));
+}
+
+/// Symmetric positive definite with eigenvalues from 1 to `ratio`.
+inline Mat3 random_inertia(check::Random& random, double ratio) {
+    const Mat3 R = random_rotation(random);
+    return R * Vec3(1.0, random.uniform(1.0, ratio), ratio).asDiagonal() * R.transpose();
+}
+
+// --- numeric derivatives -------------------------------------------------------------------------------------------------
+
+/// Jacobian by fourth-order central differences: truncation O(step⁴), rounding O(eps / step).
+template <typename Function>
+MatrixX numeric_jacobian(const Function& function, const VectorX& x, double step) {
+    const auto at = [&](Eigen::Index i, double by) -> VectorX {
+        VectorX moved = x;
+        moved[i] += by;
+        return function(moved);
+    };
+    MatrixX jacobian;
+    for (Eigen::Index i = 0; i < x.size(); ++i) {
+        const VectorX near = at(i, step) - at(i, -step), far = at(i, 2.0 * step) - at(i, -2.0 * step);
+        if (i == 0) jacobian.resize(near.size(), x.size());
+        jacobian.col(i) = (8.0 * near - far) / (12.0 * step);
+    }
+    return jacobian;
+}
+
+/// Gradient of a scalar function in the same way.
+template <typename Function>
+VectorX numeric_gradient(const Function& function, const VectorX& x, double step) {
+    return numeric_jacobian([&](const VectorX& at) { return VectorX::Constant(1, function(at)); }, x, step).transpose();
+}
+
+// --- meshes --------------------------------------------------------------------------------------------------------------
+
+struct TriangleMesh {
+    std::vector<Vec3> vertices;
+    std::vector<Eigen::Vector3i> triangles;
+};
+
+/// Prism over a polygon in the xy plane, given counterclockwise with its triangulation, from z = bottom to z = top.
+inline TriangleMesh prism(
+    const std::vector<Eigen::Vector2d>& outline, const std::vector<Eigen::Vector3i>& cap, double bottom, double top) {
+    TriangleMesh mesh;
+    const int count = static_cast<int>(outline.size());
+    for (const double z : {bottom, top})
+        for (const Eigen::Vector2d& p : outline) mesh.vertices.emplace_back(p.x(), p.y(), z);
+    for (const Eigen::Vector3i& t : cap) {
+        mesh.triangles.emplace_back(t[0], t[2], t[1]);
+        mesh.triangles.emplace_back(count + t[0], count + t[1], count + t[2]);
+    }
+    for (int i = 0; i < count; ++i) {
+        const int j = (i + 1) % count;
+        mesh.triangles.emplace_back(i, j, count + j);
+        mesh.triangles.emplace_back(i, count + j, count + i);
+    }
+    return mesh;
+}
+
+inline TriangleMesh box(const Vec3& half) {
+    return prism(
+        {{-half.x(), -half.y()}, {half.x(), -half.y()}, {half.x(), half.y()}, {-half.x(), half.y()}},
+        {{0, 1, 2}, {0, 2, 3}}, -half.z(), half.z());
+}
+
+/// Two arms of width 1 and outer length 2: a prism whose caps are not convex.
+inline TriangleMesh l_shape() {
+    return prism({{0, 0}, {2, 0}, {2, 1}, {1, 1}, {1, 2}, {0, 2}}, {{0, 1, 2}, {0, 2, 3}, {0, 3, 4}, {0, 4, 5}}, 0, 1);
+}
+
+inline TriangleMesh tetrahedron(double size = 1.0) {
+    TriangleMesh mesh;
+    mesh.vertices = {{1, 1, 1}, {1, -1, -1}, {-1, 1, -1}, {-1, -1, 1}};
+    for (Vec3& x : mesh.vertices) x *= size;
+    mesh.triangles = {{0, 1, 2}, {0, 3, 1}, {0, 2, 3}, {1, 3, 2}};
+    return mesh;
+}
+
+inline CollisionMesh collision_mesh(const TriangleMesh& mesh) {
+    return build_collision_mesh(mesh.vertices, mesh.triangles);
+}
+
+/// A convex polygon inscribed in an ellipse, in the plane through `center` with these axes.
+inline std::vector<Vec3> random_polygon(check::Random& random, int count) {
+    const Mat3 R = random_rotation(random);
+    const Vec3 center = random_vec3(random);
+    const double width = random.uniform(0.3, 1.5), height = random.uniform(0.3, 1.5);
+    std::vector<Vec3> corners;
+    for (int k = 0; k < count; ++k) {
+        const double angle = 2.0 * EIGEN_PI * (k + random.uniform(0.0, 0.7)) / count;
+        corners.push_back(center + R * Vec3(width * std::cos(angle), height * std::sin(angle), 0.0));
+    }
+    return corners;
+}
+
+// --- bodies --------------------------------------------------------------------------------------------------------------
+
+inline Body body(const TriangleMesh& mesh, double margin, BodyKind kind = BodyKind::dynamic) {
+    Body result;
+    result.kind = kind;
+    result.margin = margin;
+    result.mesh = collision_mesh(mesh);
+    return result;
+}
+
+inline Mat3 box_inertia(const Vec3& half, double mass) {
+    const Vec3 sq = half.cwiseAbs2();
+    return mass / 3.0 * Vec3(sq.y() + sq.z(), sq.x() + sq.z(), sq.x() + sq.y()).asDiagonal().toDenseMatrix();
+}
+
+inline ZoneBody zone_body(int id, const Pose& start, double mass, const Mat3& inertia_body) {
+    ZoneBody result;
+    result.id = id;
+    result.start = start;
+    result.mass = mass;
+    result.inertia = start.R * inertia_body * start.R.transpose();
+    result.inverse_inertia = result.inertia.inverse();
+    return result;
+}
+
+/// The whole matrix of a block system.
+inline MatrixX dense(const BlockSystem& system) {
+    MatrixX matrix = MatrixX::Zero(6 * system.body_count(), 6 * system.body_count());
+    for (int i = 0; i < system.body_count(); ++i) matrix.block<6, 6>(6 * i, 6 * i) = system.diagonal(i);
+    for (std::size_t k = 0; k < system.pairs().size(); ++k) {
+        const auto [i, j] = system.pairs()[k];
+        matrix.block<6, 6>(6 * i, 6 * j) = system.off_diagonal(static_cast<int>(k));
+        matrix.block<6, 6>(6 * j, 6 * i) = system.off_diagonal(static_cast<int>(k)).transpose();
+    }
+    return matrix;
+}
+
+inline VectorX flatten(const Coordinates& y) {
+    VectorX x(6 * static_cast<Eigen::Index>(y.size()));
+    for (std::size_t i = 0; i < y.size(); ++i) x.segment<6>(6 * static_cast<Eigen::Index>(i)) = y[i];
+    return x;
+}
+
+inline Coordinates unflatten(const VectorX& x) {
+    Coordinates y(static_cast<std::size_t>(x.size() / 6));
+    for (std::size_t i = 0; i < y.size(); ++i) y[i] = x.segment<6>(6 * static_cast<Eigen::Index>(i));
+    return y;
+}
+
+}  // namespace fixtures
