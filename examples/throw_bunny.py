@@ -394,7 +394,7 @@ def draw(throw: Throw, search: Search, path: Path) -> None:
         title = f"{name}: {shot.millimetres:.1f} mm from the middle of the ring at t = {STEPS * DT:.2f} s"
         draw_shot(panel, throw, shot, title)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight", pad_inches=0.08)
     plt.close(figure)
 
 
