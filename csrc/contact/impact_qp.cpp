@@ -9,7 +9,7 @@ namespace {
 constexpr int kMaxRounds = 40;
 constexpr int kMaxNewtonSteps = 50;
 constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
-constexpr double kQpTolerance = 1e-7;    // of the starting gradient: a search direction needs no more
+constexpr double kQpTolerance = 1e-9;    // of the starting gradient: a search direction needs no more
 constexpr double kMaxTurn = 0.5;         // [rad] in one direction: rows hold their meaning over that
 constexpr int kMaxTurnLimits = 5;
 constexpr double kNearby = 2.0;        // pairs this many contact ranges away are rows from the start
