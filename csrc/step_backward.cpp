@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "contact/adjoint.hpp"
+#include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
@@ -101,20 +102,14 @@ private:
             const Contact& contact = m_record.contacts[c];
             const int a = m_local[contact.object_a];
             const int b = contact.with_ground() ? kGround : m_local[contact.object_b];
-            const double mass_b = b == kGround ? kInfinity : zone.bodies[b].mass;
-            ZoneContact entry;
-            entry.contact = contact;
-            entry.a = a;
-            entry.b = b;
-            entry.pair = -1;
-            entry.range =
-                contact_range(m_model.margin(contact.object_a) + m_model.margin(contact.object_b), m_model.thickness);
-            if (zone.hard) entry.shift = m_record.shifts[c];
-            entry.range.rest += entry.shift;
-            entry.stiffness = contact_stiffness(zone.bodies[a].mass, mass_b, zone.compliance);
+            add_contact(zone, contact, a, b);
+            if (zone.hard) {
+                ZoneContact& entry = zone.contacts.back();
+                entry.shift = m_record.shifts[c];
+                entry.range.rest += entry.shift;
+            }
             if (b != kGround && a < zone.dynamic_count && b < zone.dynamic_count)
                 zone.pairs.emplace_back(std::min(a, b), std::max(a, b));
-            zone.contacts.push_back(entry);
         }
         std::sort(zone.pairs.begin(), zone.pairs.end());
         zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());

@@ -52,6 +52,8 @@ void join_passive(
     }
 }
 
+}  // namespace
+
 void add_contact(Zone& zone, const Contact& contact, int a, int b) {
     const double mass_b = b == kGround ? kInfinity : zone.bodies[b].mass;
     ZoneContact entry;
@@ -64,8 +66,6 @@ void add_contact(Zone& zone, const Contact& contact, int a, int b) {
     entry.stiffness = contact_stiffness(zone.bodies[a].mass, mass_b, zone.compliance);
     zone.contacts.push_back(entry);
 }
-
-}  // namespace
 
 ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end) {
     ContactCoverage coverage;

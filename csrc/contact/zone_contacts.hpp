@@ -11,6 +11,10 @@ struct ContactCoverage {
     std::vector<double> slack;  ///< one per dynamic body [m]
 };
 
+/// Append a contact between bodies a and b of the zone (b may be kGround) with its range and stiffness; its block of the
+/// Hessian is left open.
+void add_contact(Zone& zone, const Contact& contact, int a, int b);
+
 /// List the zone's contacts for motions along the segment from `begin` to `end` and somewhat around it. Bodies of
 /// `passive` that come near join the zone. `begin` and `end` are extended where bodies join.
 ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end);
