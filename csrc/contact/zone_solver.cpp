@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "contact/impact_gate.hpp"
+
 namespace diffsim {
 namespace {
 
@@ -95,7 +97,10 @@ private:
         if (!m_w.point.active.empty()) return false;
         m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
         for (int i = 0; i < m_zone.body_count(); ++i) m_w.y_end[i] = m_zone.bodies[i].target;
-        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
+        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
+            m_gates = find_impact_gates(m_zone, m_w.point, m_w.y_end);
+            return false;
+        }
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial);
         if (!m_w.trial.active.empty()) return false;
@@ -127,7 +132,7 @@ private:
         m_w.trial.y = y_end;
         for (int k = 0; k < kMaxHalvings; ++k) {
             const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
-            if (allowed == 1.0) {
+            if (allowed == 1.0 && gates_hold(m_gates, m_zone, m_w.trial.y)) {
                 evaluate(m_zone, m_w.trial);
                 if (m_w.trial.energy < kInfinity) return step;
             }
@@ -324,7 +329,7 @@ private:
             m_w.trial.y = m_w.y_end;
             if (step < 1.0) set_trial(m_w.y_end, step);
             const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
-            if (allowed == 1.0) return step;
+            if (allowed == 1.0 && gates_hold(m_gates, m_zone, m_w.trial.y)) return step;
             step *= std::min(allowed, 0.9);
         }
         return 0.0;
@@ -378,6 +383,7 @@ private:
     ZoneWorkspace& m_w;
     std::vector<Box>& m_visited;
     ContactCoverage m_coverage;
+    std::vector<ImpactGate> m_gates;
     double m_position = 0.0;  // size of the numbers that distances are differences of [m]
     bool m_rescue = false;    // some objects start the step below their floor
     ZoneResult m_result;

@@ -87,14 +87,7 @@ def test_a_box_thrown_sideways_does_not_pass_a_plate(speed: float) -> None:
     assert_stays_above(thrown(speed, ORIENTATIONS["askew"], 20.0, 0.2), speed)
 
 
-# Where bodies move further in one step than they are large, the iterates, each free of penetration, can lead around the
-# other body; behind it the free motion is the minimum. Promise 1 of the layer is not kept there yet.
-WALKS_AROUND = pytest.mark.xfail(strict=True, reason="bodies faster than their size per step walk around each other")
-
-
-@pytest.mark.parametrize(
-    "speed", [speed if speed < 100.0 else pytest.param(speed, marks=WALKS_AROUND) for speed in SPEEDS]
-)
+@pytest.mark.parametrize("speed", SPEEDS)
 def test_two_free_boxes_do_not_pass_through_each_other(speed: float) -> None:
     scene = ds.Scene(gravity=(0.0, 0.0, 0.0))
     for side, rpy in ((-1.0, (0.3, 0.5, 0.7)), (1.0, (0.0, 0.1, 0.2))):

@@ -1,0 +1,58 @@
+#include "contact/impact_gate.hpp"
+
+#include <algorithm>
+
+namespace diffsim {
+namespace {
+
+constexpr double kPassingPart = 0.5;  // of the smaller body's radius
+
+double size(const Zone& zone, int body) {
+    return zone.mesh(body).radius + zone.model->bodies[zone.bodies[body].id].margin;
+}
+
+/// A point of space in a body's frame at its coordinates.
+Vec3 in_body(const Zone& zone, int body, const Vec6& y, const Vec3& point) {
+    const Pose pose = pose_at(zone.bodies[body], y);
+    return pose.R.transpose() * (point - pose.t);
+}
+
+}  // namespace
+
+std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& point, const Coordinates& y_end) {
+    std::vector<ImpactGate> gates;
+    std::vector<Impact> impacts;
+    allowed_step(zone, point, y_end, &impacts);
+    std::stable_sort(impacts.begin(), impacts.end(), [](const Impact& first, const Impact& second) {
+        return first.toi < second.toi;
+    });
+    for (const Impact& impact : impacts) {
+        const ZoneContact& contact = zone.contacts[impact.contact];
+        if (contact.contact.with_ground()) continue;  // there is no way around a half-space
+        const int a = contact.a, b = contact.b;
+        const auto same = [&](const ImpactGate& gate) { return gate.a == a && gate.b == b; };
+        if (std::any_of(gates.begin(), gates.end(), same)) continue;
+        const double passing = kPassingPart * std::min(size(zone, a), size(zone, b));
+        const Vec6 relative = (y_end[a] - point.y[a]) - (y_end[b] - point.y[b]);
+        if (relative.tail<3>().norm() <= passing) continue;
+        const Vec6 y_a = point.y[a] + impact.toi * (y_end[a] - point.y[a]);
+        const Vec6 y_b = point.y[b] + impact.toi * (y_end[b] - point.y[b]);
+        const ContactGeometry geometry = contact_geometry(
+            *zone.model, contact.contact, pose_at(zone.bodies[a], y_a), pose_at(zone.bodies[b], y_b),
+            zone.ground_height);
+        gates.push_back(
+            {a, b, in_body(zone, a, y_a, geometry.closest.point_a), in_body(zone, b, y_b, geometry.closest.point_b),
+             geometry.normal, passing});
+    }
+    return gates;
+}
+
+bool gates_hold(const std::vector<ImpactGate>& gates, const Zone& zone, const Coordinates& y) {
+    return std::all_of(gates.begin(), gates.end(), [&](const ImpactGate& gate) {
+        const Vec3 x_a = pose_at(zone.bodies[gate.a], y[gate.a]) * gate.point_a;
+        const Vec3 x_b = pose_at(zone.bodies[gate.b], y[gate.b]) * gate.point_b;
+        return gate.normal.dot(x_a - x_b) >= -gate.allowed_passing;
+    });
+}
+
+}  // namespace diffsim
