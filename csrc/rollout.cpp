@@ -13,6 +13,7 @@
 #include <thread>
 
 #include "math/rotation.hpp"
+#include "scene_queries.hpp"
 
 namespace diffsim {
 namespace {
@@ -92,6 +93,16 @@ SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
         if (std::abs(norm - 1.0) > 4.0 * kEpsilon) body.orientation /= norm;  // bits of our own states stay
     }
     return state;
+}
+
+/// Steps keep what is apart apart; what crosses to begin with they would keep crossed.
+void refuse_crossing(const Model& model, const SceneState& state) {
+    if (model.body_count() < 2) return;
+    const CrossingObjects crossing = find_crossing(model, state);
+    if (crossing.a == kNobody) return;
+    throw std::invalid_argument(
+        "state: the meshes of '" + model.name(crossing.a) + "' and '" + model.name(crossing.b) +
+        "' cross; start from a state in which they are apart");
 }
 
 Parameters read_parameters(const Model& model, const RolloutInputs& in, int scene) {
@@ -291,6 +302,7 @@ RolloutInfo rollout(
     std::vector<RolloutInfo> infos(static_cast<std::size_t>(shape.batch));
     for_each_scene(shape.batch, thread_count, [&](int scene, int) {
         SceneState state = read_state(*model, inputs, scene);
+        refuse_crossing(*model, state);
         const Parameters parameters = read_parameters(*model, inputs, scene);
         StepWorkspace workspace;
         SceneControl control;

@@ -46,6 +46,20 @@ SceneState separate_state(
     return result;
 }
 
+CrossingObjects find_crossing(const Model& model, const SceneState& state) {
+    std::vector<Pose> poses;
+    std::vector<Box> boxes;
+    for (int i = 0; i < model.body_count(); ++i) {
+        poses.push_back({quaternion_to_matrix(state[i].orientation), state[i].position});
+        boxes.push_back(transformed(model.bodies[i].mesh.tree.nodes[0].box, poses.back()));
+    }
+    for (const auto& [a, b] : overlapping_pairs(build_box_tree(boxes))) {
+        if (!model.bodies[a].is_dynamic() && !model.bodies[b].is_dynamic()) continue;
+        if (meshes_cross(model.bodies[a].mesh, poses[a], model.bodies[b].mesh, poses[b])) return {a, b};
+    }
+    return {};
+}
+
 NearestObjects nearest_objects(const Model& model, const SceneState& state) {
     // Every pair of features, box trees aside: a diagnostic, not part of the step.
     NearestObjects nearest;

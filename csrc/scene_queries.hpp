@@ -10,6 +10,12 @@ namespace diffsim {
 SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state);
 
+/// The first two objects, by index, whose meshes cross and that a step would have to keep apart; kNobody if there are none.
+struct CrossingObjects {
+    int a = kNobody, b = kNobody;
+};
+CrossingObjects find_crossing(const Model& model, const SceneState& state);
+
 /// Smallest distance between the collision surfaces of any two objects, at least one of which is dynamic or kinematic.
 struct NearestObjects {
     double distance = kInfinity;

@@ -210,8 +210,8 @@ class Simulator(Measurements):
         Returns: The state one `dt` later, in the state's dtype; with a batch axis if any input has one.
         Raises:
             TypeError, ValueError: Wrong type, dtype, device or shape; values that are not finite; quaternions further
-                than 1e-3 from length 1; bodies that touch or are in the ground
-                (crossing meshes in a state made by hand are not searched for). The message names object, field, value.
+                than 1e-3 from length 1; bodies that touch, cross or are in the ground. The message
+                names object, field and value.
             SolverError: A step did not converge, if ``on_failure="raise"``.
         Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
         """

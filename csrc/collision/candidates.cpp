@@ -1,5 +1,6 @@
 #include "collision/candidates.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
 
 namespace diffsim {
@@ -68,17 +69,19 @@ void pair_cells(
     }
 }
 
+/// Calls visit_cells(cell_a, cell_b) for all pairs of cells whose swept boxes overlap.
+template <typename VisitCells>
 struct TreePairing {
     const SweptMesh& a;
     const SweptMesh& b;
-    std::vector<FeaturePair>& pairs;
+    const VisitCells& visit_cells;
 
     void visit(int node_a, const Box& box_a, int node_b, const Box& box_b) {
         if (!box_a.overlaps(box_b)) return;
         const BoxTree::Node& na = a.mesh->tree.nodes[node_a];
         const BoxTree::Node& nb = b.mesh->tree.nodes[node_b];
         if (na.is_leaf() && nb.is_leaf()) {
-            pair_cells(a, a.mesh->cells[na.item], b, b.mesh->cells[nb.item], pairs);
+            visit_cells(a.mesh->cells[na.item], b.mesh->cells[nb.item]);
         } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
             visit(na.left, node_box(a, na.left), node_b, box_b);
             visit(na.right, node_box(a, na.right), node_b, box_b);
@@ -93,13 +96,50 @@ struct TreePairing {
     }
 };
 
+template <typename VisitCells>
+void for_each_cell_pair(const SweptMesh& a, const SweptMesh& b, const VisitCells& visit_cells) {
+    if (a.mesh->tree.empty() || b.mesh->tree.empty()) return;
+    TreePairing<VisitCells>{a, b, visit_cells}.visit(0, swept_box(a), 0, swept_box(b));
+}
+
+/// Whether a side of polygon p goes through polygon q, convex and planar, with this normal.
+bool side_crosses(const std::vector<Vec3>& p, const std::vector<Vec3>& q, const Vec3& q_normal) {
+    for (std::size_t k = 0; k < p.size(); ++k) {
+        const Vec3 &from = p[k], &to = p[(k + 1) % p.size()];
+        const double height0 = q_normal.dot(from - q[0]), height1 = q_normal.dot(to - q[0]);
+        if (!(height0 * height1 < 0.0)) continue;
+        const Vec3 point = from + height0 / (height0 - height1) * (to - from);
+        bool inside = true;
+        for (std::size_t l = 0; l < q.size() && inside; ++l)
+            inside = q_normal.dot((q[(l + 1) % q.size()] - q[l]).cross(point - q[l])) >= 0.0;
+        if (inside) return true;
+    }
+    return false;
+}
+
 }  // namespace
 
 Box swept_box(const SweptMesh& swept) { return swept_box_of(swept.mesh->tree.nodes[0].box, swept); }
 
 void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs) {
-    if (a.mesh->tree.empty() || b.mesh->tree.empty()) return;
-    TreePairing{a, b, pairs}.visit(0, swept_box(a), 0, swept_box(b));
+    for_each_cell_pair(a, b, [&](const Cell& cell_a, const Cell& cell_b) { pair_cells(a, cell_a, b, cell_b, pairs); });
+}
+
+bool meshes_cross(const CollisionMesh& mesh_a, const Pose& pose_a, const CollisionMesh& mesh_b, const Pose& pose_b) {
+    const auto corners = [](const CollisionMesh& mesh, const Patch& patch, const Pose& pose) {
+        std::vector<Vec3> result;
+        for (int v : patch.vertices) result.push_back(pose * mesh.vertices[v]);
+        return result;
+    };
+    bool cross = false;
+    const SweptMesh a{&mesh_a, {pose_a, pose_a}, 0.0}, b{&mesh_b, {pose_b, pose_b}, 0.0};
+    for_each_cell_pair(a, b, [&](const Cell& cell_a, const Cell& cell_b) {
+        const Patch &patch_a = mesh_a.patches[cell_a.patch], &patch_b = mesh_b.patches[cell_b.patch];
+        if (cross || patch_a.vertices.size() < 3 || patch_b.vertices.size() < 3) return;
+        const std::vector<Vec3> p = corners(mesh_a, patch_a, pose_a), q = corners(mesh_b, patch_b, pose_b);
+        cross = side_crosses(p, q, pose_b.R * patch_b.normal) || side_crosses(q, p, pose_a.R * patch_a.normal);
+    });
+    return cross;
 }
 
 void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices) {

@@ -35,6 +35,10 @@ Box swept_box(const SweptMesh& swept);
 /// Append every feature pair whose swept boxes overlap, in an order that depends on the meshes alone.
 void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
 
+/// Whether the surfaces of two meshes at rest go through each other. One mesh wholly inside another does not count, nor do
+/// points and segments.
+bool meshes_cross(const CollisionMesh& mesh_a, const Pose& pose_a, const CollisionMesh& mesh_b, const Pose& pose_b);
+
 /// Append the vertices that come within `reach` (the mesh's own) of the half-space z <= height, at either end.
 void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices);
 

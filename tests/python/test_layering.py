@@ -17,7 +17,7 @@ ROOMS = {
     "contact": ["model", "collision"],
     "step": ["dynamics", "contact"],
     "scene_queries": ["step"],
-    "rollout": ["step"],
+    "rollout": ["scene_queries"],
     "bindings": ["rollout", "scene_queries"],
 }
 PYTHON_ROOM = "bindings"  # the only one that sees Python

@@ -177,7 +177,6 @@ def test_states_in_the_ground_are_refused_by_name(depth: float) -> None:
         sim(state.replace(position=position))
 
 
-@pytest.mark.xfail(strict=True, reason="a state made by hand is not searched for meshes that cross, only a scene is")
 @pytest.mark.parametrize("depth", [1e-4, 1e-3, 0.05])
 def test_states_in_each_other_are_refused_by_name(depth: float) -> None:
     sim = ds.Simulator(squeeze(), dt=0.01)

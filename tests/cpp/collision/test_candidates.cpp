@@ -190,3 +190,48 @@ TEST(vertices_below_a_height_are_those_of_brute_force) {
     }
     CHECK(cases_hit >= 100);
 }
+
+namespace {
+
+/// Whether two boxes overlap: no axis among face normals and cross products of edges separates them.
+bool boxes_overlap(const Vec3& half_a, const Pose& a, const Vec3& half_b, const Pose& b) {
+    std::vector<Vec3> axes;
+    for (int i = 0; i < 3; ++i) {
+        axes.push_back(a.R.col(i));
+        axes.push_back(b.R.col(i));
+        for (int j = 0; j < 3; ++j) axes.push_back(a.R.col(i).cross(b.R.col(j)));
+    }
+    return std::none_of(axes.begin(), axes.end(), [&](const Vec3& axis) {
+        const double reach =
+            (a.R.transpose() * axis).cwiseAbs().dot(half_a) + (b.R.transpose() * axis).cwiseAbs().dot(half_b);
+        return std::abs(axis.dot(a.t - b.t)) > reach + 1e-12;
+    });
+}
+
+}  // namespace
+
+TEST(meshes_cross_where_boxes_overlap) {
+    check::Random random(7);
+    const Vec3 half_a(0.5, 0.4, 0.3), half_b(0.6, 0.5, 0.2);
+    const CollisionMesh mesh_a = fixtures::collision_mesh(fixtures::box(half_a));
+    const CollisionMesh mesh_b = fixtures::collision_mesh(fixtures::box(half_b));
+    int crossing = 0, apart = 0;
+    for (int k = 0; k < 500; ++k) {
+        NOTE(k);
+        const Pose a{random_rotation(random), random_vec3(random, 0.7)};
+        const Pose b{random_rotation(random), random_vec3(random, 0.7)};
+        const bool overlap = boxes_overlap(half_a, a, half_b, b);  // neither fits into the other
+        CHECK(meshes_cross(mesh_a, a, mesh_b, b) == overlap);
+        CHECK(meshes_cross(mesh_b, b, mesh_a, a) == overlap);
+        (overlap ? crossing : apart) += 1;
+    }
+    CHECK(crossing >= 50);
+    CHECK(apart >= 50);
+}
+
+TEST(a_mesh_inside_another_does_not_cross_it) {
+    const CollisionMesh large = fixtures::collision_mesh(fixtures::box(Vec3(1.0, 1.0, 1.0)));
+    const CollisionMesh small = fixtures::collision_mesh(fixtures::box(Vec3(0.1, 0.1, 0.1)));
+    CHECK(!meshes_cross(large, Pose{}, small, Pose{}));
+    CHECK(meshes_cross(large, Pose{}, small, Pose{Mat3::Identity(), Vec3(1.0, 0.2, 0.3)}));
+}
