@@ -1,0 +1,46 @@
+"""Two small scenes that the tests of the simulator share, and how states are compared there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+import diffsim as ds
+
+STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
+BOX = (1.0, 0.7, 0.4)
+# Sums of a few terms of order one, in another order.
+ROUNDING = 1e-12
+# The same where contact, stiff as it is, multiplies what rounding leaves.
+CONTACT_ROUNDING = 1e-9
+
+
+def make_scene() -> ds.Scene:
+    scene = ds.Scene()
+    scene.add_body(
+        ds.shapes.box(BOX),
+        density=2.0,
+        position=(0, 0, 5),
+        orientation=(0.8, 0.6, 0, 0),
+        velocity=(1, 0, 2),
+        angular_velocity=(1.0, -2.0, 0.5),
+        name="box",
+    )
+    scene.add_sphere(0.25, density=3.0, position=(4, 0, 5), velocity=(0, 1, 0), name="ball")
+    return scene
+
+
+def falling_box(**options: Any) -> ds.Simulator:
+    """A tilted box about to hit the ground."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(
+        ds.shapes.box(BOX), density=2.0, position=(0, 0, 0.6), orientation=(1, 0.3, 0.1, 0), velocity=(0, 0, -5)
+    )
+    return ds.Simulator(scene, dt=0.01, **options)
+
+
+def assert_same(a: ds.State, b: ds.State) -> None:
+    for name in STATE_FIELDS:
+        assert torch.equal(getattr(a, name), getattr(b, name)), name

@@ -1,0 +1,192 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_scenes import ROUNDING, assert_same, make_scene
+from torch import Tensor
+
+import diffsim as ds
+
+
+@pytest.fixture
+def sim() -> ds.Simulator:
+    return ds.Simulator(make_scene(), dt=0.01)
+
+
+@pytest.fixture
+def state(sim: ds.Simulator) -> ds.State:
+    return sim.initial_state()
+
+
+# ---- measurements ----------------------------------------------------------------------------------------------------
+
+
+def inertia_world(sim: ds.Simulator, state: ds.State, body: int) -> np.ndarray[Any, Any]:
+    R = ds.rotation.to_matrix(state.orientation[body]).numpy()
+    product: np.ndarray[Any, Any] = R @ sim.inertia[body].numpy() @ R.T
+    return product
+
+
+def test_energies_and_momenta_are_their_formulas(sim: ds.Simulator, state: ds.State) -> None:
+    kinetic, potential, momentum, angular = 0.0, 0.0, np.zeros(3), np.zeros(3)
+    for body in range(2):
+        m, x, v, w = (t[body].numpy() for t in (sim.mass, state.position, state.velocity, state.angular_velocity))
+        spin = inertia_world(sim, state, body) @ w
+        kinetic += 0.5 * m * v @ v + 0.5 * w @ spin
+        potential -= m * sim.gravity.numpy() @ x
+        momentum += m * v
+        angular += np.cross(x, m * v) + spin
+    batch = sim.initial_state(batch=2)
+    for function, expected in (
+        (sim.kinetic_energy, kinetic),
+        (sim.potential_energy, potential),
+        (sim.momentum, momentum),
+        (sim.angular_momentum, angular),
+    ):
+        value = function(state)
+        assert value.shape == np.shape(expected)
+        np.testing.assert_allclose(value.numpy(), expected, rtol=1e-13)
+        np.testing.assert_array_equal(function(batch)[1].numpy(), value.numpy())
+        assert function(state.to(torch.float32)).dtype == torch.float32
+
+
+def test_energies_are_differentiable(sim: ds.Simulator, state: ds.State) -> None:
+    velocity = state.velocity.clone().requires_grad_()
+    sim.mass.requires_grad_()
+    (by_velocity, by_mass) = torch.autograd.grad(
+        sim.kinetic_energy(state.replace(velocity=velocity)), (velocity, sim.mass)
+    )
+    assert torch.allclose(by_velocity, sim.mass.detach()[:, None] * state.velocity)
+    assert torch.allclose(by_mass, 0.5 * state.velocity.square().sum(-1))
+
+
+def test_static_and_kinematic_bodies_do_not_count() -> None:
+    scene = ds.Scene()
+    scene.add_body(ds.shapes.box(1.0), kind="static", position=(0, 0, 5))
+    scene.add_body(ds.shapes.box(1.0), kind="kinematic", position=(3, 0, 5), velocity=(1, 0, 0))
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    assert state.velocity.any()
+    assert sim.kinetic_energy(state) == sim.potential_energy(state) == 0.0
+    assert not sim.momentum(state).any()
+
+
+def test_momentum_in_free_flight(sim: ds.Simulator, state: ds.State) -> None:
+    with torch.no_grad():
+        sim.gravity.zero_()
+    trajectory = sim.rollout(state, None, 50)
+    momentum = sim.momentum(trajectory)
+    assert momentum.shape == (50, 3)
+    assert torch.allclose(momentum, sim.momentum(state).expand(50, 3), rtol=ROUNDING, atol=ROUNDING)
+
+
+def offset_tetrahedron() -> tuple[ds.Simulator, np.ndarray[Any, Any]]:
+    vertices, faces = ds.shapes.tetrahedron(1.0)
+    vertices = np.asarray(vertices) + np.array([3.0, 0.0, 0.0])
+    scene = ds.Scene()
+    scene.add_body((vertices, faces), density=1.0, position=(0, 2, 5), orientation=(0.8, 0, 0.6, 0))
+    scene.add_sphere(0.5, density=1.0, position=(0, -5, 5))
+    scene.add_capsule(0.25, 1.0, density=1.0, position=(0, -9, 5), orientation=(0.8, 0, 0.6, 0))
+    return ds.Simulator(scene, dt=0.01), vertices
+
+
+def test_mesh_transform_places_the_mesh_as_it_was_given() -> None:
+    sim, vertices = offset_tetrahedron()
+    state = sim.initial_state()
+    transform = sim.mesh_transform(state)
+    assert transform.shape == (3, 4, 4)
+    R = ds.rotation.to_matrix(np.array([0.8, 0, 0.6, 0]))
+    np.testing.assert_allclose(transform[0, :3, :3].numpy(), R, atol=1e-15)
+    np.testing.assert_allclose(transform[0, :3, 3].numpy(), [0, 2, 5], atol=1e-14)
+    np.testing.assert_array_equal(transform[:, 3].numpy(), np.tile([0, 0, 0, 1], (3, 1)))
+    world = sim.vertices(state)
+    assert world.shape == (4 + 1 + 2, 3)
+    np.testing.assert_allclose(world[:4].numpy(), vertices @ R.T + [0, 2, 5], atol=1e-14)
+    np.testing.assert_allclose(world[4].numpy(), [0, -5, 5], atol=1e-15)
+    trajectory = sim.rollout(sim.initial_state(batch=2), None, 3)
+    assert sim.vertices(trajectory).shape == (3, 2, 7, 3)
+    assert sim.mesh_transform(trajectory).shape == (3, 2, 3, 4, 4)
+    assert torch.equal(sim.vertices(trajectory)[2, 1], sim.vertices(trajectory[2, 1]))
+
+
+def test_vertices_are_differentiable() -> None:
+    sim, _ = offset_tetrahedron()
+    state = sim.initial_state()
+
+    def world(position: Tensor, orientation: Tensor) -> Tensor:
+        return sim.vertices(state.replace(position=position, orientation=orientation))
+
+    inputs = (state.position.requires_grad_(), state.orientation.requires_grad_())
+    assert torch.autograd.gradcheck(world, inputs)
+
+
+def test_mesh_is_the_surface_in_the_world() -> None:
+    sim, _ = offset_tetrahedron()
+    state = sim.initial_state()
+    body = sim.mesh(state, 0)
+    np.testing.assert_allclose(body.vertices, sim.vertices(state)[:4].numpy(), atol=1e-14)
+    assert body.is_watertight
+    sphere = sim.mesh(state, 1)
+    np.testing.assert_allclose(np.linalg.norm(sphere.vertices - [0, -5, 5], axis=1), 0.5, rtol=1e-6)
+    capsule = sim.mesh(state, -1)
+    ends = sim.vertices(state)[5:].numpy()
+    axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    along = np.clip((capsule.vertices - ends[0]) @ axis, 0.0, 1.0)
+    np.testing.assert_allclose(
+        np.linalg.norm(capsule.vertices - ends[0] - along[:, None] * axis, axis=1), 0.25, rtol=1e-6
+    )
+    with pytest.raises(ValueError, match="mesh: state must be one state"):
+        sim.mesh(sim.initial_state(batch=2), 0)
+    with pytest.raises(IndexError):
+        sim.mesh(state, 3)
+
+
+def test_min_distance_above_the_ground_and_in_contact() -> None:
+    scene = ds.Scene()
+    scene.add_ground(margin=0.01)
+    scene.add_sphere(0.5, density=1.0, position=(0, 0, 2))
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    distance = sim.min_distance(state)
+    assert isinstance(distance, float)
+    assert distance == pytest.approx(1.49, abs=1e-12)
+    lifted = state.replace(
+        position=state.position + torch.arange(3.0).double()[:, None, None] * torch.eye(3).double()[2]
+    )
+    distances = sim.min_distance(lifted)
+    assert isinstance(distances, Tensor)
+    np.testing.assert_allclose(distances.numpy(), [1.49, 2.49, 3.49], atol=1e-12)
+
+
+def test_nothing_can_meet() -> None:
+    scene = ds.Scene()
+    scene.add_sphere(0.5, density=1.0)
+    sim = ds.Simulator(scene, dt=0.01)
+    assert sim.min_distance(sim.initial_state()) == float("inf")
+
+
+def test_separate_moves_touching_bodies_apart_in_contact() -> None:
+    scene = ds.Scene()
+    scene.add_ground(margin=1e-3)
+    ball = scene.add_sphere(0.5, density=1.0, position=(0, 0, 0.501), name="ball")
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    shift = state.position[ball, 2] - 0.501
+    assert 0.0 <= shift <= sim.thickness
+    low = state.position - torch.tensor([0.0, 0.0, 1e-4]).double()
+    low.requires_grad_()
+    apart = sim.separate(state.replace(position=low.expand(2, 1, 3)))
+    assert apart.leading_shape == (2,)
+    assert bool((apart.position[..., 2] > low[..., 2]).all())
+    (gradient,) = torch.autograd.grad(apart.position.sum(), low)
+    assert torch.equal(gradient, torch.full_like(low, 2.0))
+    assert_same(sim.separate(apart), apart)
+    sim.rollout(apart, None, 3)
+
+
+def test_measurements_name_wrong_states(sim: ds.Simulator) -> None:
+    wrong = ds.State(torch.zeros(3, 3))
+    for name in ("kinetic_energy", "potential_energy", "momentum", "angular_momentum", "min_distance", "vertices"):
+        with pytest.raises(ValueError, match=rf"{name}: state.position must have shape \(2, 3\)"):
+            getattr(sim, name)(wrong)
