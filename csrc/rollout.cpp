@@ -74,9 +74,10 @@ void require_finite(const char* field, const Model& model, int body, const Vecto
 }
 
 SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
-    SceneState state(model.bodies.size());
+    SceneState state;
+    state.bodies.resize(model.bodies.size());
     for (int i = 0; i < model.body_count(); ++i) {
-        BodyState& body = state[i];
+        BodyState& body = state.bodies[i];
         body.position = row<3>(in.position.at(0, scene), i);
         body.orientation = row<4>(in.orientation.at(0, scene), i);
         body.velocity = row<3>(in.velocity.at(0, scene), i);
@@ -127,7 +128,7 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
 
 void read_control(
     const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state, SceneControl& control) {
-    control.resize(model.bodies.size());
+    control.bodies.resize(model.bodies.size());
     const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise) {
         if (!view.present()) return otherwise;
         const Vec3 value = row<3>(view.at(time, scene), body);
@@ -136,21 +137,21 @@ void read_control(
     };
     const Vec3 zero = Vec3::Zero();
     for (int i = 0; i < model.body_count(); ++i) {
-        BodyControl& body = control[i];
+        BodyControl& body = control.bodies[i];
         body.force = read("control.force", in.force, i, zero);
         body.torque = read("control.torque", in.torque, i, zero);
-        body.velocity = read("control.body_velocity", in.body_velocity, i, state[i].velocity);
+        body.velocity = read("control.body_velocity", in.body_velocity, i, state.bodies[i].velocity);
         body.angular_velocity =
-            read("control.body_angular_velocity", in.body_angular_velocity, i, state[i].angular_velocity);
+            read("control.body_angular_velocity", in.body_angular_velocity, i, state.bodies[i].angular_velocity);
     }
 }
 
 void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene) {
-    for (int i = 0; i < static_cast<int>(state.size()); ++i) {
-        row<3>(out.position.at(time, scene), i) = state[i].position;
-        row<4>(out.orientation.at(time, scene), i) = state[i].orientation;
-        row<3>(out.velocity.at(time, scene), i) = state[i].velocity;
-        row<3>(out.angular_velocity.at(time, scene), i) = state[i].angular_velocity;
+    for (int i = 0; i < static_cast<int>(state.bodies.size()); ++i) {
+        row<3>(out.position.at(time, scene), i) = state.bodies[i].position;
+        row<4>(out.orientation.at(time, scene), i) = state.bodies[i].orientation;
+        row<3>(out.velocity.at(time, scene), i) = state.bodies[i].velocity;
+        row<3>(out.angular_velocity.at(time, scene), i) = state.bodies[i].angular_velocity;
     }
 }
 
@@ -171,23 +172,23 @@ void merge_info(StepInfo& total, const StepInfo& scene) {
 
 /// Gradients of one scene, in the order of the inputs, controls for one step or for all.
 struct SceneGradient {
-    std::vector<BodyStateGradient> state;
-    std::vector<std::vector<BodyControlGradient>> control;  // per step; empty unless asked for
+    SceneStateGradient state;
+    std::vector<SceneControlGradient> control;  // per step; empty unless asked for
     ParameterGradient parameters;
 };
 
 void add_upstream(
     const TrajectoryArrays<const double>& upstream, int time, int scene, const SceneState& end,
-    std::vector<BodyStateGradient>& gradient) {
-    for (int i = 0; i < static_cast<int>(gradient.size()); ++i) {
-        BodyStateGradient& g = gradient[i];
+    SceneStateGradient& gradient) {
+    for (int i = 0; i < static_cast<int>(gradient.bodies.size()); ++i) {
+        BodyStateGradient& g = gradient.bodies[i];
         if (upstream.position.present()) g.position += row<3>(upstream.position.at(time, scene), i);
         if (upstream.velocity.present()) g.velocity += row<3>(upstream.velocity.at(time, scene), i);
         if (upstream.angular_velocity.present())
             g.angular_velocity += row<3>(upstream.angular_velocity.at(time, scene), i);
         if (upstream.orientation.present())
-            g.orientation +=
-                quaternion_gradient_to_covector(end[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
+            g.orientation += quaternion_gradient_to_covector(
+                end.bodies[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
     }
 }
 
@@ -198,11 +199,11 @@ SceneState end_state(const Tape& tape, int scene, int time) {
     const StepRecord& record = records[time];
     SceneState end = record.start;
     if (record.held) return end;
-    for (std::size_t i = 0; i < end.size(); ++i) {
+    for (std::size_t i = 0; i < end.bodies.size(); ++i) {
         const Vec3 turn = record.y[i].head<3>();
         if (turn.isZero(0.0)) continue;
-        end[i].orientation = quaternion_multiply(exp_quaternion(turn), end[i].orientation);
-        end[i].orientation /= end[i].orientation.norm();
+        end.bodies[i].orientation = quaternion_multiply(exp_quaternion(turn), end.bodies[i].orientation);
+        end.bodies[i].orientation /= end.bodies[i].orientation.norm();
     }
     return end;
 }
@@ -214,13 +215,13 @@ SceneGradient scene_backward(
     const std::size_t count = model.bodies.size();
     const Parameters parameters = read_parameters(model, inputs, scene);
     SceneGradient gradient;
-    gradient.state.resize(count);
+    gradient.state.bodies.resize(count);
     if (keep_controls) gradient.control.resize(static_cast<std::size_t>(tape.shape.steps));
     gradient.parameters.mass.assign(count, 0.0);
     gradient.parameters.inertia.assign(count, Mat3::Zero());
     StepWorkspace workspace;
     SceneControl control;
-    std::vector<BodyControlGradient> scratch;
+    SceneControlGradient scratch;
     for (int time = tape.shape.steps - 1; time >= 0; --time) {
         const bool last = time == tape.shape.steps - 1;
         if (tape.shape.keep_time || last)
@@ -228,17 +229,18 @@ SceneGradient scene_backward(
                 upstream, tape.shape.keep_time ? time : 0, scene, end_state(tape, scene, time), gradient.state);
         const StepRecord& record = tape.records[scene][time];
         read_control(model, inputs, time, scene, record.start, control);
-        std::vector<BodyControlGradient>& control_gradient = keep_controls ? gradient.control[time] : scratch;
-        control_gradient.assign(count, BodyControlGradient{});
+        SceneControlGradient& control_gradient = keep_controls ? gradient.control[time] : scratch;
+        control_gradient.bodies.assign(count, BodyControl{});
         step_backward(
             model, tape.options, parameters, control, record, workspace, gradient.state, control_gradient,
             gradient.parameters);
         // Where a kinematic body was not driven, its own velocity drove it.
         for (std::size_t i = 0; i < count; ++i) {
             if (model.bodies[i].kind != BodyKind::kinematic) continue;
-            if (!inputs.body_velocity.present()) gradient.state[i].velocity += control_gradient[i].velocity;
+            if (!inputs.body_velocity.present())
+                gradient.state.bodies[i].velocity += control_gradient.bodies[i].velocity;
             if (!inputs.body_angular_velocity.present())
-                gradient.state[i].angular_velocity += control_gradient[i].angular_velocity;
+                gradient.state.bodies[i].angular_velocity += control_gradient.bodies[i].angular_velocity;
         }
     }
     return gradient;
@@ -252,7 +254,7 @@ void write_gradient(
         if (view.present()) row<3>(view.at(time, batch), body) += value;
     };
     for (int i = 0; i < count; ++i) {
-        const BodyStateGradient& g = gradient.state[i];
+        const BodyStateGradient& g = gradient.state.bodies[i];
         add3(out.position, 0, scene, i, g.position);
         add3(out.velocity, 0, scene, i, g.velocity);
         add3(out.angular_velocity, 0, scene, i, g.angular_velocity);
@@ -264,7 +266,7 @@ void write_gradient(
         if (out.inertia.present()) Eigen::Map<Mat3>(out.inertia.at(0, scene) + 9 * i) += gradient.parameters.inertia[i];
         const bool kinematic = tape.model->bodies[i].kind == BodyKind::kinematic;
         for (int time = 0; time < static_cast<int>(gradient.control.size()); ++time) {
-            const BodyControlGradient& c = gradient.control[time][i];
+            const BodyControl& c = gradient.control[time].bodies[i];
             if (kinematic) {
                 add3(out.body_velocity, time, scene, i, c.velocity);
                 add3(out.body_angular_velocity, time, scene, i, c.angular_velocity);

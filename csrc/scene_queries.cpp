@@ -16,7 +16,7 @@ SceneState separate_state(
     PassiveBodies passive;
     std::vector<Box> boxes;
     for (int i = 0; i < model.body_count(); ++i) {
-        const Pose pose{quaternion_to_matrix(state[i].orientation), state[i].position};
+        const Pose pose{quaternion_to_matrix(state.bodies[i].orientation), state.bodies[i].position};
         if (!model.bodies[i].is_dynamic()) {
             passive.bodies.push_back({i, pose, Vec6::Zero()});
             boxes.push_back(swept_box({&model.bodies[i].mesh, {pose, pose}, model.bodies[i].margin}));
@@ -37,7 +37,7 @@ SceneState separate_state(
     SceneState result = state;
     for (std::size_t k = 0; k < separation.poses.size(); ++k) {
         const Pose &from = zone.bodies[k].start, &to = separation.poses[k];
-        BodyState& body = result[zone.bodies[k].id];
+        BodyState& body = result.bodies[zone.bodies[k].id];
         body.position = to.t;
         const Mat3 turn = to.R * from.R.transpose();
         if (turn.isIdentity(4.0 * kEpsilon)) continue;
@@ -50,7 +50,7 @@ CrossingObjects find_crossing(const Model& model, const SceneState& state) {
     std::vector<Pose> poses;
     std::vector<Box> boxes;
     for (int i = 0; i < model.body_count(); ++i) {
-        poses.push_back({quaternion_to_matrix(state[i].orientation), state[i].position});
+        poses.push_back({quaternion_to_matrix(state.bodies[i].orientation), state.bodies[i].position});
         boxes.push_back(transformed(model.bodies[i].mesh.tree.nodes[0].box, poses.back()));
     }
     for (const auto& [a, b] : overlapping_pairs(build_box_tree(boxes))) {
@@ -64,7 +64,7 @@ NearestObjects nearest_objects(const Model& model, const SceneState& state) {
     // Every pair of features, box trees aside: a diagnostic, not part of the step.
     NearestObjects nearest;
     std::vector<Pose> poses;
-    for (const BodyState& body : state) poses.push_back({quaternion_to_matrix(body.orientation), body.position});
+    for (const BodyState& body : state.bodies) poses.push_back({quaternion_to_matrix(body.orientation), body.position});
     const auto consider = [&](double distance, int a, int b) {
         if (distance < nearest.distance) nearest = {distance, a, b};
     };

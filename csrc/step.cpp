@@ -142,16 +142,16 @@ private:
         m.bodies.resize(static_cast<std::size_t>(count));
         m.dynamic.clear();
         for (int i = 0; i < count; ++i) {
-            const BodyControl& control = m_control[i];
+            const BodyControl& control = m_control.bodies[i];
             m.rotation[i] = {Vec3::Zero(), Vec3::Zero(), 1};
             m.y[i].setZero();
             if (body(i).kind == BodyKind::kinematic)
                 m.y[i] << m_options.dt * control.angular_velocity, m_options.dt * control.velocity;
             if (!body(i).is_dynamic()) continue;
-            const Mat3 R = quaternion_to_matrix(m_state[i].orientation);
-            m.rotation[i] =
-                free_rotation(R, m_state[i].angular_velocity, control.torque, m_parameters.inertia[i], m_options.dt);
-            m.bodies[i] = moving_body(i, m_state[i], control, m_parameters, m.rotation[i], m_options.dt);
+            const Mat3 R = quaternion_to_matrix(m_state.bodies[i].orientation);
+            m.rotation[i] = free_rotation(
+                R, m_state.bodies[i].angular_velocity, control.torque, m_parameters.inertia[i], m_options.dt);
+            m.bodies[i] = moving_body(i, m_state.bodies[i], control, m_parameters, m.rotation[i], m_options.dt);
             m.y[i] = m.bodies[i].target;
             m.dynamic.push_back(i);
         }
@@ -164,7 +164,7 @@ private:
         m.boxes.clear();
         for (int i = 0; i < m_model.body_count(); ++i) {
             if (body(i).is_dynamic()) continue;
-            const Pose start{quaternion_to_matrix(m_state[i].orientation), m_state[i].position};
+            const Pose start{quaternion_to_matrix(m_state.bodies[i].orientation), m_state.bodies[i].position};
             ZoneBody driven;
             driven.start = start;
             const double reach = body(i).margin + sagitta(m.y[i], body(i).mesh.radius);
@@ -407,7 +407,7 @@ private:
         }
         SceneState result = m_state;
         for (int i = 0; i < m_model.body_count(); ++i) {
-            BodyState& end = result[i];
+            BodyState& end = result.bodies[i];
             const Vec3 turn = m.y[i].head<3>(), shift = m.y[i].tail<3>();
             if (!turn.isZero(0.0)) {
                 end.orientation = quaternion_multiply(exp_quaternion(turn), end.orientation);
@@ -418,12 +418,12 @@ private:
                 case BodyKind::dynamic:
                     // w1 = turn / dt and v1 = shift / dt, written so that free bodies keep exactly what free motion gives.
                     end.angular_velocity = m.rotation[i].angular_velocity + (turn - m.rotation[i].rotation) / dt;
-                    end.velocity = free_velocity(i, m_state[i], m_control[i], m_parameters, dt) +
+                    end.velocity = free_velocity(i, m_state.bodies[i], m_control.bodies[i], m_parameters, dt) +
                                    (shift - m.bodies[i].target.tail<3>()) / dt;
                     break;
                 case BodyKind::kinematic:
-                    end.angular_velocity = m_info.converged ? m_control[i].angular_velocity : Vec3(turn / dt);
-                    end.velocity = m_info.converged ? m_control[i].velocity : Vec3(shift / dt);
+                    end.angular_velocity = m_info.converged ? m_control.bodies[i].angular_velocity : Vec3(turn / dt);
+                    end.velocity = m_info.converged ? m_control.bodies[i].velocity : Vec3(shift / dt);
                     break;
                 case BodyKind::static_:
                     break;
@@ -459,8 +459,9 @@ StepWorkspace::StepWorkspace() : forward(std::make_unique<ForwardScratch>()) {}
 StepWorkspace::~StepWorkspace() = default;
 
 std::size_t StepRecord::bytes() const {
-    return sizeof(*this) + start.capacity() * sizeof(BodyState) + free_rotation.capacity() * sizeof(FreeRotation) +
-           y.capacity() * sizeof(Vec6) + contacts.capacity() * sizeof(Contact) +
+    return sizeof(*this) + start.bodies.capacity() * sizeof(BodyState) +
+           free_rotation.capacity() * sizeof(FreeRotation) + y.capacity() * sizeof(Vec6) +
+           contacts.capacity() * sizeof(Contact) +
            (zone_bodies.capacity() + zone_body_end.capacity() + zone_contact_end.capacity()) * sizeof(int);
 }
 

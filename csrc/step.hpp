@@ -77,20 +77,19 @@ SceneState step(
 /// What a rollout puts in place of a step from a state that penetrates: the state, unchanged and not converged.
 SceneState hold(const SceneState& state, StepInfo& info, StepRecord* record);
 
-/// d(loss)/d(BodyControl).
-using BodyControlGradient = BodyControl;
-
+/// d(loss)/d(Parameters).
 struct ParameterGradient {
     std::vector<double> mass;
     std::vector<Mat3> inertia;
     Vec3 gravity = Vec3::Zero();
+    std::vector<ClothParameters> cloths;
 };
 
 /// Carry the gradient at the end of a step back to its start. `gradient` is overwritten; control and parameter
 /// gradients are added to.
 void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
-    const StepRecord& record, StepWorkspace& workspace, std::vector<BodyStateGradient>& gradient,
-    std::vector<BodyControlGradient>& control_gradient, ParameterGradient& parameter_gradient);
+    const StepRecord& record, StepWorkspace& workspace, SceneStateGradient& gradient,
+    SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient);
 
 }  // namespace diffsim

@@ -15,8 +15,8 @@ class StepBackward {
 public:
     StepBackward(
         const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
-        const StepRecord& record, StepWorkspace& workspace, std::vector<BodyStateGradient>& gradient,
-        std::vector<BodyControlGradient>& control_gradient, ParameterGradient& parameter_gradient)
+        const StepRecord& record, StepWorkspace& workspace, SceneStateGradient& gradient,
+        SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient)
         : m_model(model),
           m_options(options),
           m_parameters(parameters),
@@ -58,7 +58,7 @@ public:
 private:
     /// d(loss)/dy of a body through its state at the end of the step.
     Vec6 upstream(int i) const {
-        const BodyStateGradient& g = m_gradient[i];
+        const BodyStateGradient& g = m_gradient.bodies[i];
         const double dt = m_options.dt;
         Vec6 v;
         v << left_jacobian(m_record.y[i].head<3>()).transpose() * g.orientation + g.angular_velocity / dt,
@@ -73,16 +73,17 @@ private:
         zone.bodies.clear();
         zone.contacts.clear();
         zone.pairs.clear();
-        zone.origin = m_record.start[m_record.zone_bodies[first_body]].position;
+        zone.origin = m_record.start.bodies[m_record.zone_bodies[first_body]].position;
         zone.ground_height = m_model.ground.height - zone.origin.z();
         ZonePoint& point = m_workspace.zone.point;
         point.y.clear();
         const auto add_body = [&](int id) {
-            const BodyState& state = m_record.start[id];
+            const BodyState& state = m_record.start.bodies[id];
             ZoneBody body;
             body.id = id;
             if (m_model.bodies[id].is_dynamic())
-                body = moving_body(id, state, m_control[id], m_parameters, m_record.free_rotation[id], m_options.dt);
+                body = moving_body(
+                    id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
             else
                 body.start = {quaternion_to_matrix(state.orientation), state.position};
             body.start.t -= zone.origin;
@@ -143,8 +144,8 @@ private:
 
     void dynamic_body(int i, bool in_zone) {
         const double dt = m_options.dt;
-        const BodyState& start = m_record.start[i];
-        const BodyStateGradient up = m_gradient[i];
+        const BodyState& start = m_record.start.bodies[i];
+        const BodyStateGradient up = m_gradient.bodies[i];
         const Vec6& y = m_record.y[i];
         const FreeRotation& rotation = m_record.free_rotation[i];
         const Mat3 R0 = quaternion_to_matrix(start.orientation);
@@ -158,7 +159,7 @@ private:
             const Vec6& z = m_multiplier[i];
             const Mat3 inertia = R0 * inertia_body * R0.transpose();
             mass_z << inertia * z.head<3>(), mass * z.tail<3>();
-            const Vec3 target_shift = dt * free_velocity(i, start, m_control[i], m_parameters, dt);
+            const Vec3 target_shift = dt * free_velocity(i, start, m_control.bodies[i], m_parameters, dt);
             const Vec3 turn_error = y.head<3>() - rotation.rotation;
             turn_covector -= inertia_rotation_gradient(inertia, turn_error, z.head<3>());
             m_parameter_gradient.inertia[i] -= inertia_body_gradient(R0, turn_error, z.head<3>());
@@ -168,9 +169,9 @@ private:
         const Vec3 grad_rotation = mass_z.head<3>() - up.angular_velocity / dt;
         const Vec3 grad_free_velocity = dt * mass_z.tail<3>();
         const FreeRotationGradient free = free_rotation_backward(
-            R0, start.angular_velocity, m_control[i].torque, inertia_body, dt, rotation, up.angular_velocity,
+            R0, start.angular_velocity, m_control.bodies[i].torque, inertia_body, dt, rotation, up.angular_velocity,
             grad_rotation);
-        BodyStateGradient& out = m_gradient[i];
+        BodyStateGradient& out = m_gradient.bodies[i];
         const Vec6& pose = m_pose_gradient[i];
         const Vec3 end_covector = up.orientation + pose.head<3>();
         out.orientation = exp_rotation(y.head<3>()).transpose() * end_covector + turn_covector + free.orientation;
@@ -179,19 +180,20 @@ private:
         out.angular_velocity = free.angular_velocity;
         m_parameter_gradient.inertia[i] += free.inertia_body;
         m_parameter_gradient.gravity += dt * grad_free_velocity;
-        m_parameter_gradient.mass[i] -= dt / (mass * mass) * m_control[i].force.dot(grad_free_velocity);
-        m_control_gradient[i].force += dt / mass * grad_free_velocity;
-        m_control_gradient[i].torque += free.torque;
+        m_parameter_gradient.mass[i] -= dt / (mass * mass) * m_control.bodies[i].force.dot(grad_free_velocity);
+        m_control_gradient.bodies[i].force += dt / mass * grad_free_velocity;
+        m_control_gradient.bodies[i].torque += free.torque;
     }
 
     void kinematic_body(int i) {
         const double dt = m_options.dt;
-        BodyStateGradient& g = m_gradient[i];
+        BodyStateGradient& g = m_gradient.bodies[i];
         const Vec3 theta = m_record.y[i].head<3>();
         const Vec3 covector = g.orientation + m_pose_gradient[i].head<3>();
         const Vec3 shift = g.position + m_pose_gradient[i].tail<3>();
-        m_control_gradient[i].angular_velocity += g.angular_velocity + dt * left_jacobian(theta).transpose() * covector;
-        m_control_gradient[i].velocity += g.velocity + dt * shift;
+        m_control_gradient.bodies[i].angular_velocity +=
+            g.angular_velocity + dt * left_jacobian(theta).transpose() * covector;
+        m_control_gradient.bodies[i].velocity += g.velocity + dt * shift;
         g.orientation = exp_rotation(theta).transpose() * covector;
         g.position = shift;
         g.velocity.setZero();
@@ -199,8 +201,8 @@ private:
     }
 
     void static_body(int i) {
-        m_gradient[i].orientation += m_pose_gradient[i].head<3>();
-        m_gradient[i].position += m_pose_gradient[i].tail<3>();
+        m_gradient.bodies[i].orientation += m_pose_gradient[i].head<3>();
+        m_gradient.bodies[i].position += m_pose_gradient[i].tail<3>();
     }
 
     const Model& m_model;
@@ -209,8 +211,8 @@ private:
     const SceneControl& m_control;
     const StepRecord& m_record;
     StepWorkspace& m_workspace;
-    std::vector<BodyStateGradient>& m_gradient;
-    std::vector<BodyControlGradient>& m_control_gradient;
+    SceneStateGradient& m_gradient;
+    SceneControlGradient& m_control_gradient;
     ParameterGradient& m_parameter_gradient;
     std::vector<Vec6> m_pose_gradient;  // along the twist of the body at the end of the step
     Coordinates m_multiplier;
@@ -221,8 +223,8 @@ private:
 
 void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
-    const StepRecord& record, StepWorkspace& workspace, std::vector<BodyStateGradient>& gradient,
-    std::vector<BodyControlGradient>& control_gradient, ParameterGradient& parameter_gradient) {
+    const StepRecord& record, StepWorkspace& workspace, SceneStateGradient& gradient,
+    SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
     StepBackward(model, options, parameters, control, record, workspace, gradient, control_gradient, parameter_gradient)
         .run();
 }

@@ -225,11 +225,12 @@ SceneState scene_state(const Model& model, const Array& position, const Array& o
     const py::ssize_t n = model.body_count();
     if (shape_of(position) != Shape{n, 3} || shape_of(orientation) != Shape{n, 4})
         throw std::invalid_argument("position and orientation must have shapes (n_bodies, 3) and (n_bodies, 4)");
-    SceneState state(model.bodies.size());
+    SceneState state;
+    state.bodies.resize(model.bodies.size());
     for (py::ssize_t i = 0; i < n; ++i) {
-        for (int k = 0; k < 3; ++k) state[i].position[k] = position.at(i, k);
-        for (int k = 0; k < 4; ++k) state[i].orientation[k] = orientation.at(i, k);
-        state[i].orientation.normalize();
+        for (int k = 0; k < 3; ++k) state.bodies[i].position[k] = position.at(i, k);
+        for (int k = 0; k < 4; ++k) state.bodies[i].orientation[k] = orientation.at(i, k);
+        state.bodies[i].orientation.normalize();
     }
     return state;
 }
@@ -255,9 +256,9 @@ py::tuple bound_separate(
     Array new_position(Shape{n, 3}), new_orientation(Shape{n, 4});
     double max_shift = 0.0;
     for (py::ssize_t i = 0; i < n; ++i) {
-        max_shift = std::max(max_shift, (moved[i].position - state[i].position).norm());
-        for (int k = 0; k < 3; ++k) new_position.mutable_at(i, k) = moved[i].position[k];
-        for (int k = 0; k < 4; ++k) new_orientation.mutable_at(i, k) = moved[i].orientation[k];
+        max_shift = std::max(max_shift, (moved.bodies[i].position - state.bodies[i].position).norm());
+        for (int k = 0; k < 3; ++k) new_position.mutable_at(i, k) = moved.bodies[i].position[k];
+        for (int k = 0; k < 4; ++k) new_orientation.mutable_at(i, k) = moved.bodies[i].orientation[k];
     }
     return py::make_tuple(new_position, new_orientation, max_shift);
 }

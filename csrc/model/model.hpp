@@ -55,11 +55,21 @@ struct Options {
     int max_iterations = 200;                  ///< Newton steps per zone and step
 };
 
+/// Physical parameters of one cloth.
+struct ClothParameters {
+    double density = 0.0;  ///< [kg/m²]
+    double stretch = 0.0;  ///< uniaxial stress resultant per strain [N/m]
+    double shear = 0.0;    ///< [N/m]
+    double bend = 0.0;     ///< bending moment per curvature and width [N·m]
+    double damping = 0.0;  ///< [s]
+};
+
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.
 struct Parameters {
     std::vector<double> mass;     ///< [kg]
     std::vector<Mat3> inertia;    ///< body frame, symmetric [kg·m²]
     Vec3 gravity = Vec3::Zero();  ///< [m/s²]
+    std::vector<ClothParameters> cloths;
 };
 
 }  // namespace diffsim

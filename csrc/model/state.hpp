@@ -14,7 +14,12 @@ struct BodyState {
     Vec3 angular_velocity = Vec3::Zero();  ///< [rad/s]
 };
 
-using SceneState = std::vector<BodyState>;
+/// Everything that moves.
+struct SceneState {
+    std::vector<BodyState> bodies;
+    std::vector<Vec3> node_position;  ///< of all cloths, one after the other, world frame [m]
+    std::vector<Vec3> node_velocity;  ///< [m/s]
+};
 
 /// What drives one body during a step.
 struct BodyControl {
@@ -24,7 +29,15 @@ struct BodyControl {
     Vec3 angular_velocity = Vec3::Zero();  ///< of a kinematic body [rad/s]
 };
 
-using SceneControl = std::vector<BodyControl>;
+/// What drives a scene during a step.
+struct SceneControl {
+    std::vector<BodyControl> bodies;
+    std::vector<Vec3> node_force;     ///< world frame [N]
+    std::vector<Vec3> node_velocity;  ///< of pinned nodes [m/s]
+};
+
+/// d(loss)/d(SceneControl).
+using SceneControlGradient = SceneControl;
 
 /// d(loss)/d(BodyState), with the orientation's as a rotation covector (math/rotation.hpp).
 struct BodyStateGradient {
@@ -32,6 +45,12 @@ struct BodyStateGradient {
     Vec3 orientation = Vec3::Zero();
     Vec3 velocity = Vec3::Zero();
     Vec3 angular_velocity = Vec3::Zero();
+};
+
+/// d(loss)/d(SceneState).
+struct SceneStateGradient {
+    std::vector<BodyStateGradient> bodies;
+    std::vector<Vec3> node_position, node_velocity;
 };
 
 }  // namespace diffsim

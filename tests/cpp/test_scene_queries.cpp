@@ -25,12 +25,12 @@ struct Scene {
         model.bodies.push_back(fixtures::body(mesh, margin, kind));
         BodyState placed;
         placed.position = position;
-        state.push_back(placed);
+        state.bodies.push_back(placed);
         parameters.mass.push_back(1.0);
         parameters.inertia.push_back(0.1 * Mat3::Identity());
         return model.body_count() - 1;
     }
-    Pose pose(int i) const { return {quaternion_to_matrix(state[i].orientation), state[i].position}; }
+    Pose pose(int i) const { return {quaternion_to_matrix(state.bodies[i].orientation), state.bodies[i].position}; }
     NearestObjects nearest() const { return nearest_objects(model, state); }
     SceneState separated() const { return separate_state(model, Options(), parameters, state); }
 };
@@ -79,7 +79,7 @@ Scene random_scene(check::Random& random, int k) {
         const fixtures::TriangleMesh meshes[] = {
             fixtures::box(Vec3(0.2, 0.3, 0.1)), fixtures::tetrahedron(0.3), point, rod};
         scene.add(meshes[(i + k) % 4], random_vec3(random, size), random.uniform(0.0, 0.2), kinds[i % 4]);
-        scene.state.back().orientation = exp_quaternion(random_vec3(random, 2.0));
+        scene.state.bodies.back().orientation = exp_quaternion(random_vec3(random, 2.0));
     }
     if (k % 2 == 0) scene.model.ground = {true, -size, 0.05};
     return scene;
@@ -137,14 +137,16 @@ TEST(separation_moves_touching_boxes_apart_and_nothing_else) {
         scene.state = scene.separated();
         CHECK(scene.nearest().distance >= -1e-6 * kThickness);
         for (int i = 0; i < 2; ++i) {
-            CHECK((scene.state[i].position - start[i].position).norm() > 1e-5);
-            CHECK((scene.state[i].position - start[i].position).norm() < 5.0 * kThickness);
+            CHECK((scene.state.bodies[i].position - start.bodies[i].position).norm() > 1e-5);
+            CHECK((scene.state.bodies[i].position - start.bodies[i].position).norm() < 5.0 * kThickness);
         }
-        CHECK(scene.state[2].position == start[2].position);
-        CHECK(scene.state[2].orientation == start[2].orientation);
+        CHECK(scene.state.bodies[2].position == start.bodies[2].position);
+        CHECK(scene.state.bodies[2].orientation == start.bodies[2].orientation);
         StepWorkspace workspace;
         StepInfo info;
-        step(scene.model, Options(), scene.parameters, scene.state, SceneControl(3), workspace, info, nullptr);
+        SceneControl control;
+        control.bodies.resize(3);
+        step(scene.model, Options(), scene.parameters, scene.state, control, workspace, info, nullptr);
         CHECK(info.converged);
     }
 }
@@ -154,9 +156,9 @@ TEST(separation_respects_what_does_not_yield) {
     scene.add(fixtures::box(Vec3(0.1, 0.1, 0.1)), Vec3(0, 0, 0.2));
     scene.add(fixtures::box(Vec3(0.3, 0.3, 0.1)), Vec3(0, 0, 0), 0.5 * kThickness, BodyKind::static_);
     const SceneState moved = scene.separated();
-    CHECK(moved[1].position == scene.state[1].position);
-    CHECK_NEAR(moved[0].position.z(), 0.2 + kThickness, 2e-2 * kThickness);
-    CHECK_NEAR(moved[0].position.head<2>(), Eigen::Vector2d::Zero(), 1e-9);
+    CHECK(moved.bodies[1].position == scene.state.bodies[1].position);
+    CHECK_NEAR(moved.bodies[0].position.z(), 0.2 + kThickness, 2e-2 * kThickness);
+    CHECK_NEAR(moved.bodies[0].position.head<2>(), Eigen::Vector2d::Zero(), 1e-9);
 }
 
 TEST(separation_leaves_what_is_apart_alone) {
@@ -164,5 +166,5 @@ TEST(separation_leaves_what_is_apart_alone) {
     scene.add(fixtures::box(Vec3(0.1, 0.1, 0.1)), Vec3(0, 0, 0));
     scene.add(fixtures::box(Vec3(0.1, 0.1, 0.1)), Vec3(0.2 + 1.01 * kThickness, 0, 0));
     const SceneState moved = scene.separated();
-    for (int i = 0; i < 2; ++i) CHECK(moved[i].position == scene.state[i].position);
+    for (int i = 0; i < 2; ++i) CHECK(moved.bodies[i].position == scene.state.bodies[i].position);
 }

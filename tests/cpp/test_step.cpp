@@ -34,8 +34,8 @@ struct Scene {
         BodyState placed;
         placed.position = position;
         placed.orientation = exp_quaternion(turn);
-        state.push_back(placed);
-        control.emplace_back();
+        state.bodies.push_back(placed);
+        control.bodies.emplace_back();
         parameters.mass.push_back(mass);
         parameters.inertia.push_back(inertia);
         return model.body_count() - 1;
@@ -92,11 +92,12 @@ struct Loss {
         double loss = 0.0;
         for (std::size_t i = 0; i < weights.size(); ++i) {
             const BodyStateGradient& w = weights[i];
-            const Mat3 turn =
-                quaternion_to_matrix(end[i].orientation) * quaternion_to_matrix(reference[i].orientation).transpose();
-            loss += w.position.dot(end[i].position - reference[i].position) + w.orientation.dot(log_rotation(turn)) +
-                    w.velocity.dot(end[i].velocity - reference[i].velocity) +
-                    w.angular_velocity.dot(end[i].angular_velocity - reference[i].angular_velocity);
+            const Mat3 turn = quaternion_to_matrix(end.bodies[i].orientation) *
+                              quaternion_to_matrix(reference.bodies[i].orientation).transpose();
+            loss += w.position.dot(end.bodies[i].position - reference.bodies[i].position) +
+                    w.orientation.dot(log_rotation(turn)) +
+                    w.velocity.dot(end.bodies[i].velocity - reference.bodies[i].velocity) +
+                    w.angular_velocity.dot(end.bodies[i].angular_velocity - reference.bodies[i].angular_velocity);
         }
         return loss;
     }
@@ -104,35 +105,38 @@ struct Loss {
 
 /// All inputs of one body, with their gradients.
 std::vector<Input> inputs_of(
-    int i, BodyKind kind, const BodyStateGradient& state, const BodyControlGradient& control,
+    int i, BodyKind kind, const BodyStateGradient& state, const BodyControl& control,
     const ParameterGradient& parameters) {
     std::vector<Input> inputs = {
-        {"position", 3, kStep, [i](Scene& s, const VectorX& x) { s.state[i].position += x; }, state.position},
+        {"position", 3, kStep, [i](Scene& s, const VectorX& x) { s.state.bodies[i].position += x; }, state.position},
         {"orientation", 3, kStep,
          [i](Scene& s, const VectorX& x) {
-             s.state[i].orientation = quaternion_multiply(exp_quaternion(Vec3(x)), s.state[i].orientation);
+             s.state.bodies[i].orientation =
+                 quaternion_multiply(exp_quaternion(Vec3(x)), s.state.bodies[i].orientation);
          },
          state.orientation}};
     if (kind == BodyKind::kinematic) {
         inputs.push_back(
-            {"driven velocity", 3, kStep / kDt, [i](Scene& s, const VectorX& x) { s.control[i].velocity += x; },
+            {"driven velocity", 3, kStep / kDt, [i](Scene& s, const VectorX& x) { s.control.bodies[i].velocity += x; },
              control.velocity});
         inputs.push_back(
             {"driven angular velocity", 3, kStep / kDt,
-             [i](Scene& s, const VectorX& x) { s.control[i].angular_velocity += x; }, control.angular_velocity});
+             [i](Scene& s, const VectorX& x) { s.control.bodies[i].angular_velocity += x; }, control.angular_velocity});
     }
     if (kind != BodyKind::dynamic) return inputs;
     const Mat3& I = parameters.inertia[i];
     VectorX by_inertia(6);
     by_inertia << I(0, 0), I(1, 1), I(2, 2), 2.0 * I(0, 1), 2.0 * I(0, 2), 2.0 * I(1, 2);
     inputs.push_back(
-        {"velocity", 3, kStep / kDt, [i](Scene& s, const VectorX& x) { s.state[i].velocity += x; }, state.velocity});
+        {"velocity", 3, kStep / kDt, [i](Scene& s, const VectorX& x) { s.state.bodies[i].velocity += x; },
+         state.velocity});
     inputs.push_back(
-        {"angular velocity", 3, kStep / kDt, [i](Scene& s, const VectorX& x) { s.state[i].angular_velocity += x; },
-         state.angular_velocity});
-    inputs.push_back({"force", 3, 1e-2, [i](Scene& s, const VectorX& x) { s.control[i].force += x; }, control.force});
+        {"angular velocity", 3, kStep / kDt,
+         [i](Scene& s, const VectorX& x) { s.state.bodies[i].angular_velocity += x; }, state.angular_velocity});
     inputs.push_back(
-        {"torque", 3, 1e-4, [i](Scene& s, const VectorX& x) { s.control[i].torque += x; }, control.torque});
+        {"force", 3, 1e-2, [i](Scene& s, const VectorX& x) { s.control.bodies[i].force += x; }, control.force});
+    inputs.push_back(
+        {"torque", 3, 1e-4, [i](Scene& s, const VectorX& x) { s.control.bodies[i].torque += x; }, control.torque});
     inputs.push_back(
         {"mass", 1, 1e-3, [i](Scene& s, const VectorX& x) { s.parameters.mass[i] += x[0]; },
          VectorX::Constant(1, parameters.mass[i])});
@@ -156,10 +160,14 @@ void check_step_gradient(const Scene& scene, int least_contacts, double toleranc
     CHECK(info.converged);
     CHECK(info.contacts >= least_contacts);
     const Loss loss(scene, 1);
-    std::vector<BodyStateGradient> gradient = loss.weights;
     const std::size_t count = scene.model.bodies.size();
-    std::vector<BodyControlGradient> control(count);
-    ParameterGradient parameters{std::vector<double>(count, 0.0), std::vector<Mat3>(count, Mat3::Zero()), Vec3::Zero()};
+    SceneStateGradient gradient;
+    gradient.bodies = loss.weights;
+    SceneControlGradient control;
+    control.bodies.resize(count);
+    ParameterGradient parameters;
+    parameters.mass.assign(count, 0.0);
+    parameters.inertia.assign(count, Mat3::Zero());
     StepWorkspace workspace;
     step_backward(
         scene.model, scene.options, scene.parameters, scene.control, record, workspace, gradient, control, parameters);
@@ -167,7 +175,7 @@ void check_step_gradient(const Scene& scene, int least_contacts, double toleranc
     std::vector<Input> inputs = {
         {"gravity", 3, 1e-3, [](Scene& s, const VectorX& x) { s.parameters.gravity += x; }, parameters.gravity}};
     for (int i = 0; i < static_cast<int>(count); ++i)
-        for (Input& input : inputs_of(i, scene.model.bodies[i].kind, gradient[i], control[i], parameters))
+        for (Input& input : inputs_of(i, scene.model.bodies[i].kind, gradient.bodies[i], control.bodies[i], parameters))
             inputs.push_back(std::move(input));
     check::Random random(2);
     for (const Input& input : inputs) {
@@ -185,25 +193,25 @@ void check_step_gradient(const Scene& scene, int least_contacts, double toleranc
         CHECK(input.gradient.allFinite());
         CHECK_NEAR(input.gradient.dot(direction), numeric, tolerance * input.gradient.norm() + kSolution / input.step);
     }
-    CHECK(gradient[0].position.norm() > 1e-2);
+    CHECK(gradient.bodies[0].position.norm() > 1e-2);
     CHECK(parameters.gravity.norm() > 1e-6);
 }
 
 Scene tumbling() {
     Scene scene;
     scene.add_box(Vec3(0.1, 0.2, 0.3), Vec3(1, 2, 3), Vec3(0.3, -0.5, 0.9));
-    scene.state[0].velocity = Vec3(1, 2, 3);
-    scene.state[0].angular_velocity = Vec3(9, -7, 5);
-    scene.control[0].force = Vec3(1, -2, 3);
-    scene.control[0].torque = Vec3(0.1, 0.2, -0.3);
+    scene.state.bodies[0].velocity = Vec3(1, 2, 3);
+    scene.state.bodies[0].angular_velocity = Vec3(9, -7, 5);
+    scene.control.bodies[0].force = Vec3(1, -2, 3);
+    scene.control.bodies[0].torque = Vec3(0.1, 0.2, -0.3);
     return scene;
 }
 
 Scene tilted_landing() {
     Scene scene = tumbling();
     scene.add_ground();
-    scene.state[0].position = Vec3(0.1, 0.2, 0.33);
-    scene.state[0].velocity.z() = -12.0;
+    scene.state.bodies[0].position = Vec3(0.1, 0.2, 0.33);
+    scene.state.bodies[0].velocity.z() = -12.0;
     return scene;
 }
 
@@ -211,7 +219,7 @@ Scene box_on_static_edge() {
     Scene scene;
     scene.add_box(Vec3(0.1, 0.1, 0.1), Vec3(0.1, 0.02, 0.155), Vec3(0.3, 0.7, 0.1));
     scene.add_box(Vec3(0.15, 0.3, 0.05), Vec3(0, 0, 0), Vec3(0, 0, 0.2), BodyKind::static_);
-    scene.state[0].velocity.z() = -8.0;
+    scene.state.bodies[0].velocity.z() = -8.0;
     return scene;
 }
 
@@ -221,9 +229,9 @@ Scene free_collision() {
         fixtures::body(fixtures::tetrahedron(0.1), 0.5 * kThickness), Vec3(0, 0, 0), Vec3(0.3, 0.2, 0.1), 2.0,
         0.008 * Mat3::Identity());
     scene.add_box(Vec3(0.1, 0.15, 0.12), Vec3(0.3, 0.05, 0.02), Vec3(-0.4, 0.2, 0.5), BodyKind::dynamic, 5.0);
-    scene.state[0].velocity = Vec3(14, 0.5, 0);
-    scene.state[0].angular_velocity = Vec3(1, 2, 3);
-    scene.state[1].velocity = Vec3(-2, 0, 0.3);
+    scene.state.bodies[0].velocity = Vec3(14, 0.5, 0);
+    scene.state.bodies[0].angular_velocity = Vec3(1, 2, 3);
+    scene.state.bodies[1].velocity = Vec3(-2, 0, 0.3);
     return scene;
 }
 
@@ -232,8 +240,8 @@ Scene pushed_ball() {
     scene.add_ball(0.1, Vec3(0.205, 0.03, 0.02), 0.7);
     scene.add_box(Vec3(0.1, 0.2, 0.2), Vec3(0, 0, 0), Vec3(0.05, 0.1, 0), BodyKind::kinematic);
     scene.add_ball(0.15, Vec3(0.47, 0.1, 0.05), 1.3);
-    scene.control[1].velocity = Vec3(6.0, 0.3, 0.2);
-    scene.control[1].angular_velocity = Vec3(0.5, -0.3, 2.0);
+    scene.control.bodies[1].velocity = Vec3(6.0, 0.3, 0.2);
+    scene.control.bodies[1].angular_velocity = Vec3(0.5, -0.3, 2.0);
     return scene;
 }
 
@@ -251,21 +259,21 @@ TEST(momentum_is_kept_in_a_collision) {
     const SceneState end = scene.step();
     Vec3 before = Vec3::Zero(), after = Vec3::Zero();
     for (int i = 0; i < 2; ++i) {
-        before += scene.parameters.mass[i] * scene.state[i].velocity;
-        after += scene.parameters.mass[i] * end[i].velocity;
+        before += scene.parameters.mass[i] * scene.state.bodies[i].velocity;
+        after += scene.parameters.mass[i] * end.bodies[i].velocity;
     }
-    CHECK((end[0].velocity - scene.state[0].velocity).norm() > 0.1);
+    CHECK((end.bodies[0].velocity - scene.state.bodies[0].velocity).norm() > 0.1);
     CHECK_NEAR(after, before, 1e-10 * before.norm());
 }
 
 TEST(flight_follows_its_formula) {
     const Scene scene = tumbling();
     const SceneState end = scene.step();
-    const BodyState& start = scene.state[0];
-    const Vec3 velocity = start.velocity + kDt * (scene.parameters.gravity + scene.control[0].force / 2.0);
-    CHECK_NEAR(end[0].velocity, velocity, 1e-14);
-    CHECK_NEAR(end[0].position, start.position + kDt * velocity, 1e-14);
-    CHECK_NEAR(end[0].orientation.norm(), 1.0, 1e-15);
+    const BodyState& start = scene.state.bodies[0];
+    const Vec3 velocity = start.velocity + kDt * (scene.parameters.gravity + scene.control.bodies[0].force / 2.0);
+    CHECK_NEAR(end.bodies[0].velocity, velocity, 1e-14);
+    CHECK_NEAR(end.bodies[0].position, start.position + kDt * velocity, 1e-14);
+    CHECK_NEAR(end.bodies[0].orientation.norm(), 1.0, 1e-15);
 }
 
 TEST(a_step_depends_on_nothing_but_its_inputs) {
@@ -278,11 +286,11 @@ TEST(a_step_depends_on_nothing_but_its_inputs) {
             const SceneState b = step(
                 scene.model, scene.options, scene.parameters, scene.state, scene.control, workspace, used, nullptr);
             CHECK(fresh.signature == used.signature);
-            for (std::size_t i = 0; i < a.size(); ++i) {
-                CHECK(a[i].position == b[i].position);
-                CHECK(a[i].orientation == b[i].orientation);
-                CHECK(a[i].velocity == b[i].velocity);
-                CHECK(a[i].angular_velocity == b[i].angular_velocity);
+            for (std::size_t i = 0; i < a.bodies.size(); ++i) {
+                CHECK(a.bodies[i].position == b.bodies[i].position);
+                CHECK(a.bodies[i].orientation == b.bodies[i].orientation);
+                CHECK(a.bodies[i].velocity == b.bodies[i].velocity);
+                CHECK(a.bodies[i].angular_velocity == b.bodies[i].angular_velocity);
             }
         }
     }
