@@ -200,7 +200,7 @@ SceneState end_state(const Tape& tape, int scene, int time) {
     SceneState end = record.start;
     if (record.held) return end;
     for (std::size_t i = 0; i < end.bodies.size(); ++i) {
-        const Vec3 turn = record.y[i].head<3>();
+        const Vec3 turn = record.y.bodies[i].head<3>();
         if (turn.isZero(0.0)) continue;
         end.bodies[i].orientation = quaternion_multiply(exp_quaternion(turn), end.bodies[i].orientation);
         end.bodies[i].orientation /= end.bodies[i].orientation.norm();

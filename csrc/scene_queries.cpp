@@ -32,9 +32,17 @@ SceneState separate_state(
     }
     passive.tree = build_box_tree(boxes);
     zone.dynamic_count = zone.body_count();
-    if (zone.bodies.empty()) return state;
+    if (!model.cloths.empty()) {
+        SceneControl control;
+        control.node_force.assign(state.node_position.size(), Vec3::Zero());
+        control.node_velocity = control.node_force;
+        zone.cloth_parameters = &parameters.cloths;
+        for (int c = 0; c < model.cloth_count(); ++c) add_cloth(zone, c, state, control, parameters);
+    }
+    if (zone.bodies.empty() && zone.nodes.empty()) return state;
     const Separation separation = separate(zone, passive);
     SceneState result = state;
+    result.node_position = separation.nodes;
     for (std::size_t k = 0; k < separation.poses.size(); ++k) {
         const Pose &from = zone.bodies[k].start, &to = separation.poses[k];
         BodyState& body = result.bodies[zone.bodies[k].id];

@@ -67,24 +67,28 @@ struct GroupOutcome {
 }  // namespace
 
 struct StepWorkspace::ForwardScratch {
-    // One entry per body, unless said otherwise.
+    // One entry per body.
     std::vector<FreeRotation> rotation;
-    Coordinates y;
     std::vector<ZoneBody> bodies;
+    // One entry per object: the bodies, then the cloths.
     std::vector<GroupOutcome> outcomes;
-    std::vector<Box> swept, visited;  ///< world frame, margins included; visited space of bodies that were in a zone
-    std::vector<char> dirty;          ///< groups to be solved, at their smallest body
+    std::vector<Box> swept, visited;  ///< world frame, margins included; visited space of objects that were in a zone
+    std::vector<char> dirty;          ///< groups to be solved, at their smallest object
     std::vector<int> zone_of;
-    PassiveBodies passive;
     UnionFind groups, touching;
+
+    Coordinates y;
+    std::vector<Vec3> elastic_shift;  ///< with split coupling: each node's motion without contact
+    PassiveBodies passive;
     std::vector<int> dynamic;              ///< the dynamic bodies
-    std::vector<int> members, member_end;  ///< dynamic bodies sorted by group; where each group ends, by smallest body
+    std::vector<int> movers;               ///< the objects that yield: the dynamic bodies and the cloths
+    std::vector<int> members, member_end;  ///< movers sorted by group; where each group ends, by smallest object
     std::vector<Box> boxes, zone_visited;
     std::vector<Contact> contacts;              ///< active, group after group
     std::vector<double> shifts;                 ///< of their rest distances
     std::vector<std::pair<int, Vec6>> blocked;  ///< kinematic bodies that did not reach their targets: where they are
     std::vector<int> near;
-    std::vector<int> zone_bodies, zone_body_end, zone_contact_end;  ///< as in StepRecord
+    std::vector<int> zone_bodies, zone_body_end, zone_cloths, zone_cloth_end, zone_contact_end;  ///< as in StepRecord
     std::vector<Contact> zone_contacts;
     std::vector<double> zone_shifts;
 };
@@ -110,6 +114,7 @@ public:
         m_info = StepInfo{};
         Clock::time_point clock = Clock::now();
         predict();
+        if (m_options.split) move_cloths_alone();
         m_info.seconds_motion = seconds_since(clock);
         for (int attempt = 0;; ++attempt) {
             list_passive();
@@ -132,29 +137,78 @@ public:
 
 private:
     const Body& body(int i) const { return m_model.bodies[i]; }
+    int object_count() const { return m_model.body_count() + m_model.cloth_count(); }
 
     // --- motion without contact --------------------------------------------------------------------------------
 
     void predict() {
         const int count = m_model.body_count();
         m.rotation.resize(static_cast<std::size_t>(count));
-        m.y.resize(static_cast<std::size_t>(count));
+        m.y.resize(static_cast<std::size_t>(count), static_cast<std::size_t>(m_model.node_count()));
         m.bodies.resize(static_cast<std::size_t>(count));
         m.dynamic.clear();
         for (int i = 0; i < count; ++i) {
             const BodyControl& control = m_control.bodies[i];
             m.rotation[i] = {Vec3::Zero(), Vec3::Zero(), 1};
-            m.y[i].setZero();
+            m.y.bodies[i].setZero();
             if (body(i).kind == BodyKind::kinematic)
-                m.y[i] << m_options.dt * control.angular_velocity, m_options.dt * control.velocity;
+                m.y.bodies[i] << m_options.dt * control.angular_velocity, m_options.dt * control.velocity;
             if (!body(i).is_dynamic()) continue;
             const Mat3 R = quaternion_to_matrix(m_state.bodies[i].orientation);
             m.rotation[i] = free_rotation(
                 R, m_state.bodies[i].angular_velocity, control.torque, m_parameters.inertia[i], m_options.dt);
             m.bodies[i] = moving_body(i, m_state.bodies[i], control, m_parameters, m.rotation[i], m_options.dt);
-            m.y[i] = m.bodies[i].target;
+            m.y.bodies[i] = m.bodies[i].target;
             m.dynamic.push_back(i);
         }
+        m.movers = m.dynamic;
+        for (int c = 0; c < m_model.cloth_count(); ++c) m.movers.push_back(count + c);
+    }
+
+    /// Split coupling, first pass: the cloths as if nothing touched them.
+    void move_cloths_alone() {
+        m.elastic_shift.resize(static_cast<std::size_t>(m_model.node_count()));
+        const PassiveBodies nobody;
+        for (int c = 0; c < m_model.cloth_count(); ++c) {
+            Zone& zone = new_zone(origin_of(m_model.body_count() + c));
+            zone.contacts_off = true;
+            add_cloth(zone, c, m_state, m_control, m_parameters);
+            const ZoneResult result = solve_zone(zone, nobody, zone_options(), m_workspace.zone, m.zone_visited);
+            note(result);
+            const int first = m_model.cloths[c].first_node;
+            for (int i = 0; i < zone.node_count(); ++i) m.elastic_shift[first + i] = m_workspace.zone.point.y.nodes[i];
+        }
+    }
+
+    ZoneOptions zone_options() const { return {m_options.tolerance, m_options.max_iterations}; }
+
+    Vec3 origin_of(int object) const {
+        return m_model.is_cloth(object) ? m_state.node_position[m_model.cloth_of(object).first_node]
+                                        : m.bodies[object].start.t;
+    }
+
+    /// The workspace's zone, empty.
+    Zone& new_zone(const Vec3& origin) {
+        Zone& zone = m_workspace.zone_problem;
+        clear(zone);
+        zone.model = &m_model;
+        set_compliance(zone, m_options.compliance);
+        zone.dt = m_options.dt;
+        zone.cloth_parameters = &m_parameters.cloths;
+        zone.origin = origin;
+        zone.ground_height = m_model.ground.height - origin.z();
+        zone.elastic = true;
+        zone.contacts_off = false;
+        return zone;
+    }
+
+    void note(const ZoneResult& result) {
+        if (result.status != ZoneStatus::converged) {
+            m_info.converged = false;
+            if (m_info.status == ZoneStatus::converged) m_info.status = result.status;
+        }
+        m_info.iterations = std::max(m_info.iterations, result.iterations);
+        m_info.residual = std::max(m_info.residual, result.residual);
     }
 
     // --- who may meet whom -------------------------------------------------------------------------------------
@@ -167,15 +221,15 @@ private:
             const Pose start{quaternion_to_matrix(m_state.bodies[i].orientation), m_state.bodies[i].position};
             ZoneBody driven;
             driven.start = start;
-            const double reach = body(i).margin + sagitta(m.y[i], body(i).mesh.radius);
-            m.boxes.push_back(swept_box({&body(i).mesh, {start, pose_at(driven, m.y[i])}, reach}));
-            m.passive.bodies.push_back({i, start, m.y[i]});
+            const double reach = body(i).margin + sagitta(m.y.bodies[i], body(i).mesh.radius);
+            m.boxes.push_back(swept_box({&body(i).mesh, {start, pose_at(driven, m.y.bodies[i])}, reach}));
+            m.passive.bodies.push_back({i, start, m.y.bodies[i]});
         }
         m.passive.tree = build_box_tree(m.boxes);
     }
 
     void group() {
-        const std::size_t count = m_model.bodies.size();
+        const std::size_t count = static_cast<std::size_t>(object_count());
         m.swept.resize(count);
         m.visited.resize(count);
         m.outcomes.assign(count, GroupOutcome{});
@@ -195,9 +249,32 @@ private:
             m.swept[i] = box;
             m.boxes.push_back(box);
         }
-        m.groups.reset(m_model.body_count());
-        for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes)))
-            m.groups.unite(m.dynamic[a], m.dynamic[b]);
+        for (int c = 0; c < m_model.cloth_count(); ++c) {
+            Box& box = m.swept[m_model.body_count() + c];
+            box = cloth_box(m_model.cloths[c]);
+            m.boxes.push_back(box);
+        }
+        m.groups.reset(object_count());
+        for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes))) m.groups.unite(m.movers[a], m.movers[b]);
+    }
+
+    /// Space for a cloth's nodes from where they are to where they went or would go.
+    Box cloth_box(const Cloth& cloth) const {
+        const double dt = m_options.dt;
+        Box box;
+        for (int k = 0; k < cloth.node_count(); ++k) {
+            const int node = cloth.first_node + k;
+            const Vec3 &x = m_state.node_position[node], &v = m_state.node_velocity[node];
+            box.include(x);
+            if (cloth.pinned[k]) {
+                box.include(x + dt * m_control.node_velocity[node]);
+                continue;
+            }
+            box.include(x + dt * v);
+            box.include(x + dt * (v + dt * m_parameters.gravity));
+        }
+        box.inflate(cloth.margin + 0.5 * m_model.thickness);
+        return box;
     }
 
     bool meets_ground(int i) const {
@@ -215,14 +292,14 @@ private:
 
     /// Solve the groups marked dirty.
     void solve_groups() {
-        // Counting sort of the bodies by group.
-        m.member_end.assign(m_model.bodies.size() + 1, 0);
-        for (int i : m.dynamic) ++m.member_end[static_cast<std::size_t>(m.groups.find(i)) + 1];
+        // Counting sort of the objects by group.
+        m.member_end.assign(static_cast<std::size_t>(object_count()) + 1, 0);
+        for (int i : m.movers) ++m.member_end[static_cast<std::size_t>(m.groups.find(i)) + 1];
         std::partial_sum(m.member_end.begin(), m.member_end.end(), m.member_end.begin());
-        m.members.resize(m.dynamic.size());
-        for (int i : m.dynamic) m.members[m.member_end[m.groups.find(i)]++] = i;
+        m.members.resize(m.movers.size());
+        for (int i : m.movers) m.members[m.member_end[m.groups.find(i)]++] = i;
         int first = 0;
-        for (int root = 0; root < m_model.body_count(); ++root) {
+        for (int root = 0; root < object_count(); ++root) {
             const int end = m.member_end[root];
             if (first < end && m.dirty[root]) solve_group(root, first, end);
             m.dirty[root] = 0;
@@ -233,40 +310,48 @@ private:
     void solve_group(int root, int first, int end) {
         GroupOutcome& outcome = m.outcomes[root];
         outcome = GroupOutcome{};
-        if (end - first == 1 && !meets_ground(root) && !meets_passive(root)) {
-            m.y[root] = m.bodies[root].target;
+        if (end - first == 1 && !m_model.is_cloth(root) && !meets_ground(root) && !meets_passive(root)) {
+            m.y.bodies[root] = m.bodies[root].target;
             m.visited[root] = m.swept[root];
             return;
         }
-        Zone& zone = m_workspace.zone_problem;
-        zone.model = &m_model;
-        set_compliance(zone, m_options.compliance);
-        zone.origin = m.bodies[root].start.t;
-        zone.ground_height = m_model.ground.height - zone.origin.z();
-        zone.bodies.clear();
-        for (int k = first; k < end; ++k) {
+        Zone& zone = new_zone(origin_of(root));
+        for (int k = first; k < end; ++k) {  // sorted: bodies come before cloths
+            if (m_model.is_cloth(m.members[k])) {
+                add_cloth(zone, m.members[k] - m_model.body_count(), m_state, m_control, m_parameters);
+                continue;
+            }
             zone.bodies.push_back(m.bodies[m.members[k]]);
             zone.bodies.back().start.t -= zone.origin;
         }
-        zone.dynamic_count = end - first;
-        const ZoneOptions options{m_options.tolerance, m_options.max_iterations};
+        zone.dynamic_count = zone.body_count();
+        if (m_options.split) {
+            zone.elastic = false;
+            for (const ZoneCloth& cloth : zone.cloths)
+                for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
+                    zone.nodes[cloth.first_node + k].target = m.elastic_shift[m_model.cloths[cloth.id].first_node + k];
+        }
         outcome.solved = true;
-        outcome.result = solve_zone(zone, m.passive, options, m_workspace.zone, m.zone_visited);
+        outcome.result = solve_zone(zone, m.passive, zone_options(), m_workspace.zone, m.zone_visited);
         const ZonePoint& point = m_workspace.zone.point;
         if (outcome.result.status == ZoneStatus::bad_start)
             refuse_start(zone.contacts[outcome.result.worst_contact], point.distances[outcome.result.worst_contact]);
         for (int k = first; k < end; ++k) {
             const int i = m.members[k];
-            m.y[i] = point.y[k - first];
             m.visited[i] = m.zone_visited[k - first];
-            m.visited[i].inflate(body(i).margin);
+            m.visited[i].inflate(m_model.margin(i));
             m.visited[i].lower += zone.origin;
             m.visited[i].upper += zone.origin;
+            if (!m_model.is_cloth(i)) m.y.bodies[i] = point.y.bodies[k - first];
         }
+        for (const ZoneCloth& cloth : zone.cloths)
+            for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
+                m.y.nodes[m_model.cloths[cloth.id].first_node + k] = point.y.nodes[cloth.first_node + k];
         keep_contacts(zone, point, outcome);
         if (outcome.result.status == ZoneStatus::converged) return;
         for (int k = zone.dynamic_count; k < zone.body_count(); ++k)
-            if (point.y[k] != zone.bodies[k].target) m.blocked.emplace_back(zone.bodies[k].id, point.y[k]);
+            if (point.y.bodies[k] != zone.bodies[k].target)
+                m.blocked.emplace_back(zone.bodies[k].id, point.y.bodies[k]);
     }
 
     void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outcome) {
@@ -297,19 +382,19 @@ private:
     /// solved again. False if there are none.
     bool merge_met_groups() {
         bool left = false;
-        for (int i : m.dynamic) {
+        for (int i : m.movers) {
             left = left || (m.visited[i].lower.array() < m.swept[i].lower.array()).any() ||
                    (m.visited[i].upper.array() > m.swept[i].upper.array()).any();
         }
         if (!left) return false;
         m.boxes.clear();
-        for (int i : m.dynamic) {
+        for (int i : m.movers) {
             m.swept[i].include(m.visited[i]);
             m.boxes.push_back(m.swept[i]);
         }
         bool merged = false;
         for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes))) {
-            const int i = m.groups.find(m.dynamic[a]), j = m.groups.find(m.dynamic[b]);
+            const int i = m.groups.find(m.movers[a]), j = m.groups.find(m.movers[b]);
             if (i == j) continue;
             m.groups.unite(i, j);
             m.outcomes[i] = m.outcomes[j] = GroupOutcome{};
@@ -325,64 +410,75 @@ private:
         m_info.status = ZoneStatus::blocked;
         for (const auto& [i, reached] : m.blocked) {
             if (stop)
-                m.y[i].setZero();
-            else if (reached.squaredNorm() < m.y[i].squaredNorm())
-                m.y[i] = reached;
+                m.y.bodies[i].setZero();
+            else if (reached.squaredNorm() < m.y.bodies[i].squaredNorm())
+                m.y.bodies[i] = reached;
         }
     }
 
     // --- results -----------------------------------------------------------------------------------------------
 
-    /// Zones of bodies that really touch: what the backward solves together.
+    /// Zones of objects that really touch, and of every cloth: what the backward solves together.
     void find_zones() {
-        const int count = m_model.body_count();
-        const auto yields = [&](int object) { return object >= 0 && body(object).is_dynamic(); };
+        const int count = object_count();
+        const auto yields = [&](int object) {
+            return object >= 0 && (m_model.is_cloth(object) || body(object).is_dynamic());
+        };
         m.touching.reset(count);
         m.zone_of.assign(static_cast<std::size_t>(count), -1);
-        std::size_t contact_count = 0;
-        for (int root : m.dynamic) {
-            for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k) {
-                const Contact& c = m.contacts[k];
-                ++contact_count;
-                if (yields(c.object_a)) m.zone_of[c.object_a] = 0;
-                if (yields(c.object_b)) m.zone_of[c.object_b] = 0;
-                if (yields(c.object_a) && yields(c.object_b)) m.touching.unite(c.object_a, c.object_b);
-            }
-        }
-        // Number the zones by their smallest bodies, then sort bodies and contacts by zone.
+        for (int c = m_model.body_count(); c < count; ++c) m.zone_of[c] = 0;
+        const auto for_each_contact = [&](const auto& visit) {
+            for (int root : m.movers)
+                for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k) visit(k);
+        };
+        m_info.contacts = 0;
+        for_each_contact([&](int k) {
+            const Contact& c = m.contacts[k];
+            ++m_info.contacts;
+            if (yields(c.object_a)) m.zone_of[c.object_a] = 0;
+            if (yields(c.object_b)) m.zone_of[c.object_b] = 0;
+            if (yields(c.object_a) && yields(c.object_b)) m.touching.unite(c.object_a, c.object_b);
+        });
+        // Number the zones by their smallest objects, then sort objects and contacts by zone.
         m.zone_body_end.clear();
-        for (int i : m.dynamic) {
+        m.zone_cloth_end.clear();
+        for (int i : m.movers) {
             if (m.zone_of[i] < 0) continue;
             const int root = m.touching.find(i);
             if (root == i) {
                 m.zone_of[i] = static_cast<int>(m.zone_body_end.size());
                 m.zone_body_end.push_back(0);
+                m.zone_cloth_end.push_back(0);
             } else {
                 m.zone_of[i] = m.zone_of[root];
             }
-            ++m.zone_body_end[m.zone_of[i]];
+            ++(m_model.is_cloth(i) ? m.zone_cloth_end : m.zone_body_end)[m.zone_of[i]];
         }
-        m_info.zones = static_cast<int>(m.zone_body_end.size());
-        m_info.contacts = static_cast<int>(contact_count);
         m.zone_contact_end.assign(m.zone_body_end.size(), 0);
         const auto zone_of_contact = [&](const Contact& c) {
             return m.zone_of[yields(c.object_a) ? c.object_a : c.object_b];
         };
-        const auto for_each_contact = [&](const auto& visit) {
-            for (int root : m.dynamic)
-                for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k) visit(k);
-        };
         for_each_contact([&](int k) { ++m.zone_contact_end[zone_of_contact(m.contacts[k])]; });
-        int bodies = 0, contacts = 0;
+        int bodies = 0, cloths = 0, contacts = 0;
         for (std::size_t z = 0; z < m.zone_body_end.size(); ++z) {
-            m_info.largest_zone = std::max(m_info.largest_zone, m.zone_body_end[z]);
+            if (m.zone_contact_end[z] > 0) {
+                ++m_info.zones;
+                m_info.largest_zone = std::max(m_info.largest_zone, m.zone_body_end[z] + m.zone_cloth_end[z]);
+            }
             bodies += std::exchange(m.zone_body_end[z], bodies);
+            cloths += std::exchange(m.zone_cloth_end[z], cloths);
             contacts += std::exchange(m.zone_contact_end[z], contacts);
         }
         m.zone_bodies.resize(static_cast<std::size_t>(bodies));
+        m.zone_cloths.resize(static_cast<std::size_t>(cloths));
         m.zone_contacts.resize(static_cast<std::size_t>(contacts));
-        for (int i : m.dynamic)
-            if (m.zone_of[i] >= 0) m.zone_bodies[m.zone_body_end[m.zone_of[i]]++] = i;
+        for (int i : m.movers) {
+            if (m.zone_of[i] < 0) continue;
+            if (m_model.is_cloth(i))
+                m.zone_cloths[m.zone_cloth_end[m.zone_of[i]]++] = i - m_model.body_count();
+            else
+                m.zone_bodies[m.zone_body_end[m.zone_of[i]]++] = i;
+        }
         m.zone_shifts.resize(m.zone_contacts.size());
         for_each_contact([&](int k) {
             const int slot = m.zone_contact_end[zone_of_contact(m.contacts[k])]++;
@@ -393,22 +489,17 @@ private:
 
     SceneState finish() {
         const double dt = m_options.dt;
-        for (int root : m.dynamic) {
+        for (int root : m.movers) {
             const GroupOutcome& outcome = m.outcomes[root];
             if (!outcome.solved) continue;
-            if (outcome.result.status != ZoneStatus::converged) {
-                m_info.converged = false;
-                if (m_info.status == ZoneStatus::converged) m_info.status = outcome.result.status;
-            }
-            m_info.iterations = std::max(m_info.iterations, outcome.result.iterations);
-            m_info.residual = std::max(m_info.residual, outcome.result.residual);
+            note(outcome.result);
             m_info.max_compression = std::max(m_info.max_compression, outcome.max_compression);
             m_info.signature = mix(m_info.signature, outcome.signature);
         }
         SceneState result = m_state;
         for (int i = 0; i < m_model.body_count(); ++i) {
             BodyState& end = result.bodies[i];
-            const Vec3 turn = m.y[i].head<3>(), shift = m.y[i].tail<3>();
+            const Vec3 turn = m.y.bodies[i].head<3>(), shift = m.y.bodies[i].tail<3>();
             if (!turn.isZero(0.0)) {
                 end.orientation = quaternion_multiply(exp_quaternion(turn), end.orientation);
                 end.orientation /= end.orientation.norm();
@@ -429,6 +520,14 @@ private:
                     break;
             }
         }
+        for (const Cloth& cloth : m_model.cloths) {
+            for (int k = 0; k < cloth.node_count(); ++k) {
+                const int node = cloth.first_node + k;
+                result.node_position[node] += m.y.nodes[node];
+                result.node_velocity[node] =
+                    cloth.pinned[k] && m_info.converged ? m_control.node_velocity[node] : Vec3(m.y.nodes[node] / dt);
+            }
+        }
         return result;
     }
 
@@ -438,6 +537,9 @@ private:
         record.y = m.y;
         record.zone_bodies = m.zone_bodies;
         record.zone_body_end = m.zone_body_end;
+        record.zone_cloths = m.zone_cloths;
+        record.zone_cloth_end = m.zone_cloth_end;
+        if (m_options.split) record.elastic_shift = m.elastic_shift;
         record.zone_contact_end = m.zone_contact_end;
         record.contacts = m.zone_contacts;
         if (m_options.compliance == 0.0) record.shifts = m.zone_shifts;
@@ -460,9 +562,14 @@ StepWorkspace::~StepWorkspace() = default;
 
 std::size_t StepRecord::bytes() const {
     return sizeof(*this) + start.bodies.capacity() * sizeof(BodyState) +
-           free_rotation.capacity() * sizeof(FreeRotation) + y.capacity() * sizeof(Vec6) +
+           free_rotation.capacity() * sizeof(FreeRotation) + y.bodies.capacity() * sizeof(Vec6) +
+           (start.node_position.capacity() + start.node_velocity.capacity() + y.nodes.capacity() +
+            elastic_shift.capacity()) *
+               sizeof(Vec3) +
            contacts.capacity() * sizeof(Contact) +
-           (zone_bodies.capacity() + zone_body_end.capacity() + zone_contact_end.capacity()) * sizeof(int);
+           (zone_bodies.capacity() + zone_body_end.capacity() + zone_cloths.capacity() + zone_cloth_end.capacity() +
+            zone_contact_end.capacity()) *
+               sizeof(int);
 }
 
 ZoneBody moving_body(
@@ -477,6 +584,29 @@ ZoneBody moving_body(
     body.target << rotation.rotation, dt * free_velocity(id, state, control, parameters, dt);
     body.warm << dt * state.angular_velocity, dt * state.velocity;
     return body;
+}
+
+void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters) {
+    const Cloth& cloth = zone.model->cloths[id];
+    ZoneCloth entry;
+    entry.id = id;
+    entry.first_node = zone.node_count();
+    entry.start = elastic_start(cloth, state.node_position.data() + cloth.first_node);
+    zone.cloths.push_back(std::move(entry));
+    for (int k = 0; k < cloth.node_count(); ++k) {
+        const int i = cloth.first_node + k;
+        ZoneNode node;
+        node.start = state.node_position[i] - zone.origin;
+        node.mass = parameters.cloths[id].density * cloth.node_area[k];
+        node.pinned = cloth.pinned[k] != 0;
+        const Vec3 velocity =
+            node.pinned
+                ? control.node_velocity[i]
+                : free_node_velocity(state.node_velocity[i], control.node_force[i], node.mass, parameters, zone.dt);
+        node.target = zone.dt * velocity;
+        node.warm = zone.dt * state.node_velocity[i];
+        zone.nodes.push_back(node);
+    }
 }
 
 SceneState step(

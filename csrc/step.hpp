@@ -17,9 +17,10 @@ struct StepRecord {
     SceneState start;
     bool held = false;                        ///< nothing moved, see hold(); the rest is empty
     std::vector<FreeRotation> free_rotation;  ///< one per body
-    Coordinates y;                            ///< one per body: the motion (turn, shift) of the step
-    /// Dynamic bodies in contact, zone after zone, and the active contacts of each zone.
-    std::vector<int> zone_bodies, zone_body_end, zone_contact_end;
+    Coordinates y;                            ///< the motion of the step: (turn, shift) per body, shift per node
+    std::vector<Vec3> elastic_shift;          ///< per node: its motion without contact; with split coupling only
+    /// Dynamic bodies in contact and all cloths, zone after zone, and the active contacts of each zone.
+    std::vector<int> zone_bodies, zone_body_end, zone_cloths, zone_cloth_end, zone_contact_end;
     std::vector<Contact> contacts;
     std::vector<double> shifts;  ///< of hard contacts' rest distances; empty when contacts give way
 
@@ -30,8 +31,8 @@ struct StepInfo {
     bool converged = true;
     ZoneStatus status = ZoneStatus::converged;  ///< of the first zone that did not converge
     int contacts = 0;
-    int zones = 0;         ///< groups of bodies in contact
-    int largest_zone = 0;  ///< bodies
+    int zones = 0;         ///< groups of bodies and cloths in contact
+    int largest_zone = 0;  ///< bodies and cloths
     int iterations = 0;    ///< Newton steps of the zone that took most
     double residual = 0.0;
     double max_compression = 0.0;  ///< of a contact below its rest distance [m]
@@ -45,10 +46,19 @@ ZoneBody moving_body(
     int id, const BodyState& state, const BodyControl& control, const Parameters& parameters,
     const FreeRotation& rotation, double dt);
 
+/// Append a cloth at the start of a step to a zone, whose origin and dt are set.
+void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters);
+
 /// Velocity at the end of a step in which nothing touches the body: v0 + dt (g + f / m).
 inline Vec3 free_velocity(
     int id, const BodyState& state, const BodyControl& control, const Parameters& parameters, double dt) {
     return state.velocity + dt * (parameters.gravity + control.force / parameters.mass[id]);
+}
+
+/// The same for a cloth node of this mass that nothing touches, not even its neighbours.
+inline Vec3 free_node_velocity(
+    const Vec3& velocity, const Vec3& force, double mass, const Parameters& parameters, double dt) {
+    return velocity + dt * (parameters.gravity + force / mass);
 }
 
 /// Objects penetrate in the state a step was to start from; says which.

@@ -33,12 +33,12 @@ public:
         m_pose_gradient.assign(count, Vec6::Zero());
         m_multiplier.assign(count, Vec6::Zero());
         std::vector<char> in_zone(count, 0);
-        int first_body = 0, first_contact = 0;
+        ZoneRange first;
         for (std::size_t k = 0; k < m_record.zone_body_end.size(); ++k) {
-            for (int b = first_body; b < m_record.zone_body_end[k]; ++b) in_zone[m_record.zone_bodies[b]] = 1;
-            solve_zone_adjoint(first_body, m_record.zone_body_end[k], first_contact, m_record.zone_contact_end[k]);
-            first_body = m_record.zone_body_end[k];
-            first_contact = m_record.zone_contact_end[k];
+            const ZoneRange end{m_record.zone_body_end[k], m_record.zone_cloth_end[k], m_record.zone_contact_end[k]};
+            for (int b = first.body; b < end.body; ++b) in_zone[m_record.zone_bodies[b]] = 1;
+            solve_zone_adjoint(first, end);
+            first = end;
         }
         for (int i = 0; i < static_cast<int>(count); ++i) {
             switch (m_model.bodies[i].kind) {
@@ -61,66 +61,100 @@ private:
         const BodyStateGradient& g = m_gradient.bodies[i];
         const double dt = m_options.dt;
         Vec6 v;
-        v << left_jacobian(m_record.y[i].head<3>()).transpose() * g.orientation + g.angular_velocity / dt,
+        v << left_jacobian(m_record.y.bodies[i].head<3>()).transpose() * g.orientation + g.angular_velocity / dt,
             g.position + g.velocity / dt;
         return v;
     }
 
-    void solve_zone_adjoint(int first_body, int body_end, int first_contact, int contact_end) {
+    Vec3 node_upstream(int i) const { return m_gradient.node_position[i] + m_gradient.node_velocity[i] / m_options.dt; }
+
+    /// Where a zone's bodies, cloths and contacts begin or end in the record.
+    struct ZoneRange {
+        int body = 0, cloth = 0, contact = 0;
+    };
+
+    /// The workspace's zone, with the bodies and cloths of the record that yield.
+    Zone& rebuild_zone(const ZoneRange& first, const ZoneRange& end) {
         Zone& zone = m_workspace.zone_problem;
+        clear(zone);
         zone.model = &m_model;
         set_compliance(zone, m_options.compliance);
-        zone.bodies.clear();
-        zone.contacts.clear();
-        zone.pairs.clear();
-        zone.origin = m_record.start.bodies[m_record.zone_bodies[first_body]].position;
+        zone.dt = m_options.dt;
+        zone.cloth_parameters = &m_parameters.cloths;
+        zone.elastic = !m_options.split;
+        zone.contacts_off = false;
+        zone.origin = first.body < end.body
+                          ? m_record.start.bodies[m_record.zone_bodies[first.body]].position
+                          : m_record.start.node_position[m_model.cloths[m_record.zone_cloths[first.cloth]].first_node];
         zone.ground_height = m_model.ground.height - zone.origin.z();
-        ZonePoint& point = m_workspace.zone.point;
-        point.y.clear();
-        const auto add_body = [&](int id) {
-            const BodyState& state = m_record.start.bodies[id];
-            ZoneBody body;
-            body.id = id;
-            if (m_model.bodies[id].is_dynamic())
-                body = moving_body(
-                    id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
-            else
-                body.start = {quaternion_to_matrix(state.orientation), state.position};
-            body.start.t -= zone.origin;
-            m_local[id] = static_cast<int>(zone.bodies.size());
-            zone.bodies.push_back(body);
-            point.y.push_back(m_record.y[id]);
-        };
-        m_local.resize(m_model.bodies.size(), -1);
-        for (int b = first_body; b < body_end; ++b) add_body(m_record.zone_bodies[b]);
-        zone.dynamic_count = body_end - first_body;
-        for (int c = first_contact; c < contact_end; ++c) {
+        m_workspace.zone.point.y.resize(0, 0);
+        for (int b = first.body; b < end.body; ++b) join_body(zone, m_record.zone_bodies[b]);
+        zone.dynamic_count = end.body - first.body;
+        for (int c = first.cloth; c < end.cloth; ++c) join_cloth(zone, m_record.zone_cloths[c]);
+        return zone;
+    }
+
+    void join_body(Zone& zone, int id) {
+        const BodyState& state = m_record.start.bodies[id];
+        ZoneBody body;
+        body.id = id;
+        if (m_model.bodies[id].is_dynamic())
+            body = moving_body(id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
+        else
+            body.start = {quaternion_to_matrix(state.orientation), state.position};
+        body.start.t -= zone.origin;
+        m_local[id] = static_cast<int>(zone.bodies.size());
+        zone.bodies.push_back(body);
+        m_workspace.zone.point.y.bodies.push_back(m_record.y.bodies[id]);
+    }
+
+    void join_cloth(Zone& zone, int id) {
+        const Cloth& cloth = m_model.cloths[id];
+        m_local[m_model.body_count() + id] = static_cast<int>(zone.cloths.size());
+        add_cloth(zone, id, m_record.start, m_control, m_parameters);
+        const int first = zone.cloths.back().first_node;
+        for (int k = 0; k < cloth.node_count(); ++k) {
+            m_workspace.zone.point.y.nodes.push_back(m_record.y.nodes[cloth.first_node + k]);
+            if (m_options.split) zone.nodes[first + k].target = m_record.elastic_shift[cloth.first_node + k];
+        }
+    }
+
+    void list_contacts(Zone& zone, const ZoneRange& first, const ZoneRange& end) {
+        for (int c = first.contact; c < end.contact; ++c) {
             const Contact& contact = m_record.contacts[c];
             for (int object : {contact.object_a, contact.object_b})
-                if (object >= 0 && m_local[object] < 0) add_body(object);
+                if (object >= 0 && m_local[object] < 0) join_body(zone, object);  // one that does not yield
         }
-        for (int c = first_contact; c < contact_end; ++c) {
+        const auto object_of = [&](int object) {
+            if (object == kGround) return ZoneObject{kGround, -1};
+            return m_model.is_cloth(object) ? ZoneObject{kNobody, m_local[object]} : ZoneObject{m_local[object], -1};
+        };
+        for (int c = first.contact; c < end.contact; ++c) {
             const Contact& contact = m_record.contacts[c];
-            const int a = m_local[contact.object_a];
-            const int b = contact.with_ground() ? kGround : m_local[contact.object_b];
-            add_contact(zone, contact, a, b);
+            add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
+            ZoneContact& entry = zone.contacts.back();
             if (zone.hard) {
-                ZoneContact& entry = zone.contacts.back();
                 entry.shift = m_record.shifts[c];
                 entry.range.rest += entry.shift;
             }
-            if (b != kGround && a < zone.dynamic_count && b < zone.dynamic_count)
-                zone.pairs.emplace_back(std::min(a, b), std::max(a, b));
+            if (zone.yields(entry.a) && zone.yields(entry.b))
+                zone.pairs.emplace_back(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
         }
         std::sort(zone.pairs.begin(), zone.pairs.end());
         zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());
         for (ZoneContact& entry : zone.contacts) {
-            if (entry.b == kGround || entry.a >= zone.dynamic_count || entry.b >= zone.dynamic_count) continue;
+            if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
             const std::pair<int, int> key(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
             entry.pair =
                 static_cast<int>(std::lower_bound(zone.pairs.begin(), zone.pairs.end(), key) - zone.pairs.begin());
         }
+    }
 
+    void solve_zone_adjoint(const ZoneRange& first, const ZoneRange& end) {
+        m_local.resize(m_model.bodies.size() + m_model.cloths.size(), -1);
+        Zone& zone = rebuild_zone(first, end);
+        list_contacts(zone, first, end);
+        ZonePoint& point = m_workspace.zone.point;
         evaluate(zone, point);
         bool below_floor = false;
         for (std::size_t k = 0; k < zone.contacts.size(); ++k)
@@ -130,23 +164,123 @@ private:
             evaluate(zone, point);
         }
         Coordinates upstreams;
-        for (int b = first_body; b < body_end; ++b) upstreams.push_back(upstream(m_record.zone_bodies[b]));
+        for (int b = first.body; b < end.body; ++b) upstreams.bodies.push_back(upstream(m_record.zone_bodies[b]));
+        for (const ZoneCloth& cloth : zone.cloths)
+            for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
+                upstreams.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
         const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_workspace.zone.system);
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
             m_local[id] = -1;
-            m_pose_gradient[id] += adjoint.pose_gradient[k];
+            m_pose_gradient[id] += adjoint.place_gradient.bodies[k];
             if (k >= zone.dynamic_count) continue;
-            m_multiplier[id] = adjoint.multiplier[k];
+            m_multiplier[id] = adjoint.multiplier.bodies[k];
             m_parameter_gradient.mass[id] += adjoint.mass_gradient[k];
         }
+        if (zone.cloths.empty()) return;
+        for (const ZoneCloth& cloth : zone.cloths) m_local[m_model.body_count() + cloth.id] = -1;
+        if (m_options.split)
+            split_cloths(zone, adjoint);
+        else
+            finish_cloths(zone, adjoint);
+    }
+
+    /// Split coupling: carry the contact pass's gradient with respect to its targets on through the elastic pass.
+    void split_cloths(const Zone& contact_zone, const ZoneAdjoint& contact) {
+        for (const ZoneCloth& cloth : contact_zone.cloths) {
+            const Cloth& model = m_model.cloths[cloth.id];
+            Zone zone;
+            zone.model = &m_model;
+            zone.dt = m_options.dt;
+            zone.cloth_parameters = &m_parameters.cloths;
+            zone.origin = contact_zone.origin;
+            zone.contacts_off = true;
+            ZonePoint point;
+            add_cloth(zone, cloth.id, m_record.start, m_control, m_parameters);
+            Coordinates upstreams;
+            for (int k = 0; k < model.node_count(); ++k) {
+                const int node = cloth.first_node + k;
+                const Vec3& z = contact.multiplier.nodes[node];
+                upstreams.nodes.push_back(contact_zone.nodes[node].mass * z);
+                point.y.nodes.push_back(m_record.elastic_shift[model.first_node + k]);
+                // of the mass in  m (u - target)
+                const Vec3 error =
+                    m_record.y.nodes[model.first_node + k] - m_record.elastic_shift[model.first_node + k];
+                const double mass_gradient = contact.node_mass_gradient[node] - z.dot(error);
+                m_parameter_gradient.cloths[cloth.id].density += mass_gradient * model.node_area[k];
+            }
+            evaluate(zone, point);
+            ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_workspace.zone.system);
+            for (int k = 0; k < model.node_count(); ++k) {
+                const int node = cloth.first_node + k;
+                adjoint.place_gradient.nodes[k] += contact.place_gradient.nodes[node];
+                const int id = model.first_node + k;
+                if (zone.nodes[k].pinned) {
+                    pinned_node(id, adjoint.place_gradient.nodes[k]);
+                } else {
+                    const Vec3 error = m_record.elastic_shift[id] - zone.nodes[k].target;
+                    free_node(cloth.id, k, adjoint.multiplier.nodes[k], error, 0.0, adjoint.place_gradient.nodes[k]);
+                }
+            }
+            add_material(cloth.id, adjoint.cloth_gradient[0]);
+        }
+    }
+
+    void finish_cloths(const Zone& zone, const ZoneAdjoint& adjoint) {
+        for (std::size_t c = 0; c < zone.cloths.size(); ++c) {
+            const ZoneCloth& cloth = zone.cloths[c];
+            const Cloth& model = m_model.cloths[cloth.id];
+            for (int k = 0; k < model.node_count(); ++k) {
+                const int node = cloth.first_node + k;
+                const Vec3& place = adjoint.place_gradient.nodes[node];
+                if (zone.nodes[node].pinned) {
+                    pinned_node(model.first_node + k, place);
+                    continue;
+                }
+                const Vec3 error = m_record.y.nodes[model.first_node + k] - zone.nodes[node].target;
+                free_node(cloth.id, k, adjoint.multiplier.nodes[node], error, adjoint.node_mass_gradient[node], place);
+            }
+            add_material(cloth.id, adjoint.cloth_gradient[c]);
+        }
+    }
+
+    void add_material(int cloth, const ClothParameters& gradient) {
+        ClothParameters& sum = m_parameter_gradient.cloths[cloth];
+        sum.stretch += gradient.stretch;
+        sum.shear += gradient.shear;
+        sum.bend += gradient.bend;
+        sum.damping += gradient.damping;
+    }
+
+    /// A free node with multiplier z of m (u - target) + ... = 0, target = dt (v0 + dt (g + f / m)).
+    void free_node(int cloth, int k, const Vec3& z, const Vec3& error, double mass_gradient, const Vec3& place) {
+        const Cloth& model = m_model.cloths[cloth];
+        const int node = model.first_node + k;
+        const double dt = m_options.dt;
+        const double mass = m_parameters.cloths[cloth].density * model.node_area[k];
+        const Vec3 grad_velocity = dt * mass * z;  // of the velocity at the end of free motion
+        const Vec3& force = m_control.node_force[node];
+        mass_gradient -= z.dot(error) + dt / (mass * mass) * force.dot(grad_velocity);
+        m_parameter_gradient.cloths[cloth].density += mass_gradient * model.node_area[k];
+        m_parameter_gradient.gravity += dt * grad_velocity;
+        m_control_gradient.node_force[node] += dt / mass * grad_velocity;
+        m_gradient.node_position[node] += place;
+        m_gradient.node_velocity[node] = grad_velocity;
+    }
+
+    /// A pinned node, whose motion is dt times its given velocity.
+    void pinned_node(int node, const Vec3& place) {
+        const Vec3 position = m_gradient.node_position[node] + place;
+        m_control_gradient.node_velocity[node] += m_gradient.node_velocity[node] + m_options.dt * position;
+        m_gradient.node_position[node] = position;
+        m_gradient.node_velocity[node].setZero();
     }
 
     void dynamic_body(int i, bool in_zone) {
         const double dt = m_options.dt;
         const BodyState& start = m_record.start.bodies[i];
         const BodyStateGradient up = m_gradient.bodies[i];
-        const Vec6& y = m_record.y[i];
+        const Vec6& y = m_record.y.bodies[i];
         const FreeRotation& rotation = m_record.free_rotation[i];
         const Mat3 R0 = quaternion_to_matrix(start.orientation);
         const Mat3& inertia_body = m_parameters.inertia[i];
@@ -188,7 +322,7 @@ private:
     void kinematic_body(int i) {
         const double dt = m_options.dt;
         BodyStateGradient& g = m_gradient.bodies[i];
-        const Vec3 theta = m_record.y[i].head<3>();
+        const Vec3 theta = m_record.y.bodies[i].head<3>();
         const Vec3 covector = g.orientation + m_pose_gradient[i].head<3>();
         const Vec3 shift = g.position + m_pose_gradient[i].tail<3>();
         m_control_gradient.bodies[i].angular_velocity +=
@@ -215,8 +349,8 @@ private:
     SceneControlGradient& m_control_gradient;
     ParameterGradient& m_parameter_gradient;
     std::vector<Vec6> m_pose_gradient;  // along the twist of the body at the end of the step
-    Coordinates m_multiplier;
-    std::vector<int> m_local;  // index in the zone at hand, by body
+    std::vector<Vec6> m_multiplier;
+    std::vector<int> m_local;  // index in the zone at hand, by object; -1 if it is not in it
 };
 
 }  // namespace

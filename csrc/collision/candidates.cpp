@@ -15,10 +15,21 @@ Box swept_box_of(const Box& box_body, const SweptMesh& swept) {
 
 Box vertex_box(const SweptMesh& swept, int vertex) {
     Box box;
-    box.include(swept.sweep.begin * swept.mesh->vertices[vertex]);
-    box.include(swept.sweep.end * swept.mesh->vertices[vertex]);
+    if (swept.begin != nullptr) {
+        box.include(swept.begin[vertex]);
+        box.include(swept.end[vertex]);
+    } else {
+        box.include(swept.sweep.begin * swept.mesh->vertices[vertex]);
+        box.include(swept.sweep.end * swept.mesh->vertices[vertex]);
+    }
     box.inflate(swept.reach);
     return box;
+}
+
+const BoxTree& tree_of(const SweptMesh& swept) { return swept.tree != nullptr ? *swept.tree : swept.mesh->tree; }
+
+Box node_box(const SweptMesh& swept, int node) {
+    return swept.tree != nullptr ? swept.tree->nodes[node].box : swept_box_of(swept.mesh->tree.nodes[node].box, swept);
 }
 
 Box edge_box(const SweptMesh& swept, int edge) {
@@ -78,8 +89,8 @@ struct TreePairing {
 
     void visit(int node_a, const Box& box_a, int node_b, const Box& box_b) {
         if (!box_a.overlaps(box_b)) return;
-        const BoxTree::Node& na = a.mesh->tree.nodes[node_a];
-        const BoxTree::Node& nb = b.mesh->tree.nodes[node_b];
+        const BoxTree::Node& na = tree_of(a).nodes[node_a];
+        const BoxTree::Node& nb = tree_of(b).nodes[node_b];
         if (na.is_leaf() && nb.is_leaf()) {
             visit_cells(a.mesh->cells[na.item], b.mesh->cells[nb.item]);
         } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
@@ -90,10 +101,6 @@ struct TreePairing {
             visit(node_a, box_a, nb.right, node_box(b, nb.right));
         }
     }
-
-    static Box node_box(const SweptMesh& swept, int node) {
-        return swept_box_of(swept.mesh->tree.nodes[node].box, swept);
-    }
 };
 
 template <typename VisitCells>
@@ -101,6 +108,64 @@ void for_each_cell_pair(const SweptMesh& a, const SweptMesh& b, const VisitCells
     if (a.mesh->tree.empty() || b.mesh->tree.empty()) return;
     TreePairing<VisitCells>{a, b, visit_cells}.visit(0, swept_box(a), 0, swept_box(b));
 }
+
+/// Pairs of features of one mesh, of cells that overlap.
+class SelfPairing {
+public:
+    SelfPairing(const SweptMesh& swept, std::vector<FeaturePair>& pairs)
+        : m_swept(swept), m_nodes(tree_of(swept).nodes), m_pairs(pairs) {}
+
+    void visit(int node) {
+        const BoxTree::Node& n = m_nodes[node];
+        if (n.is_leaf()) return;  // the features of one cell share vertices
+        visit(n.left);
+        visit(n.right);
+        visit(n.left, n.right);
+    }
+
+private:
+    void visit(int node_a, int node_b) {
+        const BoxTree::Node &na = m_nodes[node_a], &nb = m_nodes[node_b];
+        if (!na.box.overlaps(nb.box)) return;
+        if (na.is_leaf() && nb.is_leaf()) {
+            pair(m_swept.mesh->cells[na.item], m_swept.mesh->cells[nb.item]);
+        } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
+            visit(na.left, node_b);
+            visit(na.right, node_b);
+        } else {
+            visit(node_a, nb.left);
+            visit(node_a, nb.right);
+        }
+    }
+
+    void pair(const Cell& cell_a, const Cell& cell_b) {
+        const std::size_t first = m_pairs.size();
+        pair_cells(m_swept, cell_a, m_swept, cell_b, m_pairs);
+        const auto share = [&](const FeaturePair& pair) {
+            const CollisionMesh& mesh = *m_swept.mesh;
+            const auto in_patch = [&](int vertex, int patch) {
+                const std::vector<int>& loop = mesh.patches[patch].vertices;
+                return std::find(loop.begin(), loop.end(), vertex) != loop.end();
+            };
+            switch (pair.type) {
+                case ContactType::vertex_patch:
+                    return in_patch(pair.feature_a, pair.feature_b);
+                case ContactType::patch_vertex:
+                    return in_patch(pair.feature_b, pair.feature_a);
+                case ContactType::edge_edge:
+                    break;
+            }
+            const Edge &a = mesh.edges[pair.feature_a], &b = mesh.edges[pair.feature_b];
+            return a.p0 == b.p0 || a.p0 == b.p1 || a.p1 == b.p0 || a.p1 == b.p1;
+        };
+        m_pairs.erase(
+            std::remove_if(m_pairs.begin() + static_cast<std::ptrdiff_t>(first), m_pairs.end(), share), m_pairs.end());
+    }
+
+    const SweptMesh& m_swept;
+    const std::vector<BoxTree::Node>& m_nodes;
+    std::vector<FeaturePair>& m_pairs;
+};
 
 /// Whether a side of polygon p goes through polygon q, convex and planar, with this normal.
 bool side_crosses(const std::vector<Vec3>& p, const std::vector<Vec3>& q, const Vec3& q_normal) {
@@ -119,10 +184,28 @@ bool side_crosses(const std::vector<Vec3>& p, const std::vector<Vec3>& q, const 
 
 }  // namespace
 
-Box swept_box(const SweptMesh& swept) { return swept_box_of(swept.mesh->tree.nodes[0].box, swept); }
+BoxTree refitted_tree(const SweptMesh& swept) {
+    BoxTree tree = swept.mesh->tree;
+    for (std::size_t k = tree.nodes.size(); k-- > 0;) {  // children follow their parents
+        BoxTree::Node& node = tree.nodes[k];
+        if (node.is_leaf()) {
+            node.box = patch_box(swept, swept.mesh->cells[node.item].patch);
+        } else {
+            node.box = tree.nodes[node.left].box;
+            node.box.include(tree.nodes[node.right].box);
+        }
+    }
+    return tree;
+}
+
+Box swept_box(const SweptMesh& swept) { return node_box(swept, 0); }
 
 void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs) {
     for_each_cell_pair(a, b, [&](const Cell& cell_a, const Cell& cell_b) { pair_cells(a, cell_a, b, cell_b, pairs); });
+}
+
+void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs) {
+    if (!tree_of(swept).empty()) SelfPairing(swept, pairs).visit(0);
 }
 
 bool meshes_cross(const CollisionMesh& mesh_a, const Pose& pose_a, const CollisionMesh& mesh_b, const Pose& pose_b) {
@@ -144,6 +227,11 @@ bool meshes_cross(const CollisionMesh& mesh_a, const Pose& pose_a, const Collisi
 
 void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices) {
     if (swept_box(swept).lower.z() > height) return;
+    if (swept.begin != nullptr) {
+        for (int v : swept.mesh->active_vertices)
+            if (std::min(swept.begin[v].z(), swept.end[v].z()) <= height + swept.reach) vertices.push_back(v);
+        return;
+    }
     const Vec3 up0 = swept.sweep.begin.R.row(2), up1 = swept.sweep.end.R.row(2);
     const double limit0 = height + swept.reach - swept.sweep.begin.t.z();
     const double limit1 = height + swept.reach - swept.sweep.end.t.z();

@@ -13,11 +13,15 @@ struct Sweep {
     Pose begin, end;
 };
 
-/// A mesh in motion, and how far around itself it looks for others.
+/// A mesh in motion, rigid or deforming, and how far around itself it looks for others.
 struct SweptMesh {
     const CollisionMesh* mesh;
-    Sweep sweep;
+    Sweep sweep;   ///< of a rigid mesh
     double reach;  ///< half-width added to all boxes [m]
+    // Of a deforming mesh: its vertices at both ends of their straight paths, and its tree fitted to them.
+    const Vec3* begin = nullptr;
+    const Vec3* end = nullptr;
+    const BoxTree* tree = nullptr;
 };
 
 enum class ContactType : std::uint8_t { vertex_patch, patch_vertex, edge_edge };
@@ -29,11 +33,17 @@ struct FeaturePair {
     int feature_a, feature_b;
 };
 
+/// The tree of a deforming mesh, fitted to its swept vertices and reach.
+BoxTree refitted_tree(const SweptMesh& swept);
+
 /// World box around a mesh's swept vertices, inflated by its reach.
 Box swept_box(const SweptMesh& swept);
 
 /// Append every feature pair whose swept boxes overlap, in an order that depends on the meshes alone.
 void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
+
+/// The same within one deforming mesh; features that share a vertex do not count.
+void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs);
 
 /// Whether the surfaces of two meshes at rest go through each other. One mesh wholly inside another does not count, nor do
 /// points and segments.

@@ -10,57 +10,182 @@
 namespace diffsim {
 namespace {
 
-/// The contacts as rows of the paper's J, in the coordinates y, and their stiffness.
+/// The free coordinates as one vector: bodies, then nodes that are not pinned.
+class FreeCoordinates {
+public:
+    explicit FreeCoordinates(const Zone& zone) : m_zone(zone), m_size(6 * zone.dynamic_count) {
+        for (const ZoneNode& node : zone.nodes) {
+            m_rows.push_back(node.pinned ? -1 : m_size);
+            if (!node.pinned) m_size += 3;
+        }
+    }
+    Eigen::Index size() const { return m_size; }
+    Eigen::Index row(int node) const { return m_rows[static_cast<std::size_t>(node)]; }  ///< -1 if pinned
+
+    VectorX flatten(const Coordinates& y) const {
+        VectorX x(m_size);
+        for (int i = 0; i < m_zone.dynamic_count; ++i) x.segment<6>(6 * i) = y.bodies[i];
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (row(i) >= 0) x.segment<3>(row(i)) = y.nodes[i];
+        return x;
+    }
+    Coordinates unflatten(const VectorX& x) const {
+        Coordinates y;
+        y.assign_zero(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
+        for (int i = 0; i < m_zone.dynamic_count; ++i) y.bodies[i] = x.segment<6>(6 * i);
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (row(i) >= 0) y.nodes[i] = x.segment<3>(row(i));
+        return y;
+    }
+
+private:
+    const Zone& m_zone;
+    Eigen::Index m_size;
+    std::vector<Eigen::Index> m_rows;
+};
+
+constexpr int kMaxSize = 18;
+using SmallVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMaxSize, 1>;
+using SmallMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, kMaxSize, kMaxSize>;
+
+/// The derivatives of an active contact and what they are taken along: one or two objects, each a body's twist (6) or the
+/// nodes of a cloth's feature (9).
+struct ContactTerm {
+    struct Side {
+        int body = kNobody;
+        std::array<int, 3> nodes = {-1, -1, -1};
+        int offset = 0;
+    };
+    std::array<Side, 2> sides;
+    int side_count = 2;
+    SmallVector row, gradient;
+    SmallMatrix hessian;
+    double force, stiffness;
+
+    /// Call body_part(body, offset) and node_part(node, offset) for everything the term is taken along.
+    template <class BodyPart, class NodePart>
+    void for_each(const BodyPart& body_part, const NodePart& node_part) const {
+        for (int s = 0; s < side_count; ++s) {
+            const Side& side = sides[static_cast<std::size_t>(s)];
+            if (side.body >= 0) {
+                body_part(side.body, side.offset);
+                continue;
+            }
+            for (int k = 0; k < 3; ++k) {
+                const int node = side.nodes[static_cast<std::size_t>(k)];
+                if (node >= 0) node_part(node, side.offset + 3 * k);
+            }
+        }
+    }
+};
+
+/// The derivatives of one active contact of a zone.
+class ContactTermMaker {
+public:
+    ContactTermMaker(const Zone& zone, const ZonePoint& point) : m_zone(zone), m_point(point) {}
+
+    ContactTerm operator()(const ActiveContact& active, bool with_curvature) const {
+        const ZoneContact& contact = m_zone.contacts[active.index];
+        ContactTerm term;
+        if (contact.contact.with_ground()) {
+            term.side_count = 1;
+            if (contact.cloth_a >= 0)
+                node_on_ground(contact, active, term);
+            else
+                body_on_ground(contact, active, with_curvature, term);
+            return term;
+        }
+        if (contact.cloth_a >= 0)
+            fill(
+                contact, active, with_curvature, cloth(contact, active, true, term),
+                cloth(contact, active, false, term), term);
+        else if (contact.cloth_b >= 0)
+            fill(contact, active, with_curvature, body(contact.a, 0, term), cloth(contact, active, false, term), term);
+        else
+            fill(contact, active, with_curvature, body(contact.a, 0, term), body(contact.b, 1, term), term);
+        return term;
+    }
+
+private:
+    BodySide body(int index, std::size_t side, ContactTerm& term) const {
+        term.sides[side].body = index;
+        return {m_point.poses[index].t};
+    }
+    ClothSide cloth(const ZoneContact& contact, const ActiveContact& active, bool of_a, ContactTerm& term) const {
+        term.sides[of_a ? 0 : 1].nodes = feature_nodes(m_zone, contact, of_a);
+        const Surface surface = of_a ? surface_a(m_zone, contact, m_point.poses, m_point.nodes)
+                                     : surface_b(m_zone, contact, m_point.poses, m_point.nodes);
+        return cloth_side(contact.contact, active.geometry, surface, of_a);
+    }
+
+    template <class A, class B>
+    static void fill(
+        const ZoneContact& contact, const ActiveContact& active, bool with_curvature, const A& a, const B& b,
+        ContactTerm& term) {
+        term.sides[1].offset = A::kSize;
+        const auto d =
+            contact_derivatives(active.geometry, contact.range, contact.stiffness.value, a, b, true, with_curvature);
+        term.row = d.row;
+        term.gradient = d.gradient;
+        term.hessian = d.hessian;
+        term.force = d.force;
+        term.stiffness = d.stiffness;
+    }
+
+    void body_on_ground(
+        const ZoneContact& contact, const ActiveContact& active, bool with_curvature, ContactTerm& term) const {
+        term.sides[0].body = contact.a;
+        const GroundDerivatives d = ground_derivatives(
+            active.geometry.distance, active.geometry.closest.point_a - m_point.poses[contact.a].t, contact.range,
+            contact.stiffness.value, with_curvature);
+        term.row = d.row;
+        term.gradient = -d.force * d.row;
+        term.hessian = d.hessian;
+        term.force = d.force;
+        term.stiffness = d.stiffness;
+    }
+
+    void node_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
+        term.sides[0].nodes = feature_nodes(m_zone, contact, true);
+        const PotentialValue potential = contact_potential(
+            contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
+            contact.stiffness.value);
+        term.row = Vec3::UnitZ();
+        term.gradient = -potential.force * term.row;
+        term.hessian = potential.stiffness * term.row * term.row.transpose();
+        term.force = potential.force;
+        term.stiffness = potential.stiffness;
+    }
+
+    const Zone& m_zone;
+    const ZonePoint& m_point;
+};
+
+/// The contacts as rows of the paper's J, in the free coordinates, and their stiffness.
 struct Rows {
     MatrixX J;          // m x n
     VectorX stiffness;  // m [kg]
 };
 
-/// Derivatives of an active contact; with the ground only the parts of body a are set.
-ContactDerivatives derivatives_of(
-    const Zone& zone, const ZonePoint& point, const ActiveContact& active, bool with_curvature) {
-    const ZoneContact& contact = zone.contacts[active.index];
-    const Vec3& center_a = point.poses[contact.a].t;
-    if (!contact.contact.with_ground())
-        return contact_derivatives(
-            active.geometry, contact.range, contact.stiffness.value, center_a, point.poses[contact.b].t, true,
-            with_curvature);
-    const GroundDerivatives ground = ground_derivatives(
-        active.geometry.distance, active.geometry.closest.point_a - center_a, contact.range, contact.stiffness.value,
-        with_curvature);
-    ContactDerivatives result;
-    result.row.head<6>() = ground.row;
-    result.gradient.head<6>() = -ground.force * ground.row;
-    result.hessian.topLeftCorner<6, 6>() = ground.hessian;
-    result.force = ground.force;
-    result.stiffness = ground.stiffness;
-    return result;
-}
-
-Rows collect_rows(const Zone& zone, const ZonePoint& point) {
+Rows collect_rows(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free) {
+    const ContactTermMaker make_term(zone, point);
     const Eigen::Index count = static_cast<Eigen::Index>(point.active.size());
-    Rows rows{MatrixX::Zero(count, 6 * zone.dynamic_count), VectorX(count)};
+    Rows rows{MatrixX::Zero(count, free.size()), VectorX(count)};
     for (Eigen::Index k = 0; k < count; ++k) {
-        const ActiveContact& active = point.active[static_cast<std::size_t>(k)];
-        const ZoneContact& contact = zone.contacts[active.index];
-        const ContactDerivatives d = derivatives_of(zone, point, active, false);
-        rows.stiffness[k] = d.stiffness;
-        if (contact.a < zone.dynamic_count)
-            rows.J.block<1, 6>(k, 6 * contact.a) = d.row.head<6>().transpose() * chart_jacobian(point.y[contact.a]);
-        if (contact.b >= 0 && contact.b < zone.dynamic_count)
-            rows.J.block<1, 6>(k, 6 * contact.b) = d.row.tail<6>().transpose() * chart_jacobian(point.y[contact.b]);
+        const ContactTerm term = make_term(point.active[static_cast<std::size_t>(k)], false);
+        rows.stiffness[k] = term.stiffness;
+        term.for_each(
+            [&](int body, int offset) {
+                if (!zone.yields(body)) return;
+                rows.J.block<1, 6>(k, 6 * body) =
+                    term.row.segment<6>(offset).transpose() * chart_jacobian(point.y.bodies[body]);
+            },
+            [&](int node, int offset) {
+                if (free.row(node) >= 0)
+                    rows.J.block<1, 3>(k, free.row(node)) = term.row.segment<3>(offset).transpose();
+            });
     }
     return rows;
-}
-
-VectorX flatten(const Coordinates& y) {
-    return Eigen::Map<const VectorX>(y[0].data(), 6 * static_cast<Eigen::Index>(y.size()));
-}
-
-Coordinates unflatten(const VectorX& x) {
-    Coordinates y(static_cast<std::size_t>(x.size() / 6));
-    for (std::size_t i = 0; i < y.size(); ++i) y[i] = x.segment<6>(6 * static_cast<Eigen::Index>(i));
-    return y;
 }
 
 Mat6 mass_matrix(const ZoneBody& body) {
@@ -70,51 +195,103 @@ Mat6 mass_matrix(const ZoneBody& body) {
     return mass;
 }
 
-/// [ M  Jᵀ ; J  -1/stiffness ] [z; λ] = [v; 0]   [Qiao et al. 2020, Eq. 9, its constraint rows softened]
-Coordinates solve_dense(const Zone& zone, const Rows& rows, const Coordinates& upstream) {
+/// Inertia and, exactly, elasticity of the cloths' free nodes.
+MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free, ElasticHessian kind) {
+    const Eigen::Index first = 6 * zone.dynamic_count, size = free.size() - first;
+    MatrixX matrix = MatrixX::Zero(size, size);
+    if (size == 0) return matrix;
+    BlockSystem cloth;
+    BlockPattern pattern = base_pattern(zone);
+    pattern.body_count = 0;
+    pattern.body_pairs.clear();
+    cloth.set_pattern(std::move(pattern));
+    cloth.set_zero();
+    if (zone.elastic) add_elastic_hessian(zone, point, kind, cloth);
+    for (int i = 0; i < zone.node_count(); ++i) {
+        if (free.row(i) < 0) continue;
+        const Eigen::Index r = free.row(i) - first;
+        matrix.block<3, 3>(r, r) = cloth.node_diagonal(i) + zone.nodes[i].mass * Mat3::Identity();
+    }
+    const IndexPairs& pairs = cloth.pattern().node_pairs;
+    for (std::size_t k = 0; k < pairs.size(); ++k) {
+        const Eigen::Index r = free.row(pairs[k].first) - first, c = free.row(pairs[k].second) - first;
+        if (r < 0 || c < 0) continue;
+        matrix.block<3, 3>(r, c) = cloth.node_pair(static_cast<int>(k));
+        matrix.block<3, 3>(c, r) = cloth.node_pair(static_cast<int>(k)).transpose();
+    }
+    return matrix;
+}
+
+/// [ A  Jᵀ ; J  -1/stiffness ] [z; λ] = [v; 0], A inertia and elasticity.
+/// [Qiao et al. 2020, Eq. 9, its constraint rows softened]
+Coordinates solve_dense(
+    const Zone& zone, const FreeCoordinates& free, const MatrixX& cloth, const Rows& rows,
+    const Coordinates& upstream) {
     const Eigen::Index n = rows.J.cols(), m = rows.J.rows();
     MatrixX kkt = MatrixX::Zero(n + m, n + m);
     for (int i = 0; i < zone.dynamic_count; ++i) kkt.block<6, 6>(6 * i, 6 * i) = mass_matrix(zone.bodies[i]);
+    kkt.block(6 * zone.dynamic_count, 6 * zone.dynamic_count, cloth.rows(), cloth.cols()) = cloth;
     kkt.topRightCorner(n, m) = rows.J.transpose();
     kkt.bottomLeftCorner(m, n) = rows.J;
     for (Eigen::Index k = 0; k < m; ++k) kkt(n + k, n + k) = -1.0 / rows.stiffness[k];
     VectorX rhs = VectorX::Zero(n + m);
-    rhs.head(n) = flatten(upstream);
-    return unflatten(kkt.partialPivLu().solve(rhs).head(n));
+    rhs.head(n) = free.flatten(upstream);
+    return free.unflatten(kkt.partialPivLu().solve(rhs).head(n));
 }
 
+/// Cholesky factor of inertia and elasticity: 6x6 per body, one of all nodes.
+class InertiaFactor {
+public:
+    InertiaFactor(const Zone& zone, const MatrixX& cloth) : m_bodies(zone.dynamic_count), m_cloth(cloth.llt()) {
+        for (int i = 0; i < m_bodies; ++i) m_factors.push_back(mass_matrix(zone.bodies[i]).llt().matrixL());
+    }
+    /// Overwrite x by L⁻¹ x.
+    template <class Matrix>
+    void solve_lower(Matrix& x) const {
+        for (int i = 0; i < m_bodies; ++i) {
+            auto block = x.template middleRows<6>(6 * i);
+            block = m_factors[static_cast<std::size_t>(i)].template triangularView<Eigen::Lower>().solve(block).eval();
+        }
+        if (m_cloth.rows() == 0) return;
+        auto block = x.bottomRows(m_cloth.rows());
+        block = m_cloth.matrixL().solve(block).eval();
+    }
+    /// Overwrite x by L⁻ᵀ x.
+    void solve_upper(VectorX& x) const {
+        for (int i = 0; i < m_bodies; ++i)
+            m_factors[static_cast<std::size_t>(i)].triangularView<Eigen::Lower>().transpose().solveInPlace(
+                x.segment<6>(6 * i));
+        if (m_cloth.rows() == 0) return;
+        auto block = x.tail(m_cloth.rows());
+        block = m_cloth.matrixU().solve(block).eval();
+    }
+
+private:
+    int m_bodies;
+    std::vector<Mat6> m_factors;
+    Eigen::LLT<MatrixX> m_cloth;
+};
+
 /// With B = stiffness^½ J L⁻ᵀ and Bᵀ P = Q R:  (I + Bᵀ B)⁻¹ = I - Q (I - (I + R Rᵀ)⁻¹) Qᵀ, whatever the rank of B.
-Coordinates solve_qr(const Zone& zone, const Rows& rows, const Coordinates& upstream) {
+Coordinates solve_qr(
+    const FreeCoordinates& free, const InertiaFactor& factor, const Rows& rows, const Coordinates& upstream) {
     const Eigen::Index n = rows.J.cols(), m = rows.J.rows();
-    std::vector<Mat6> factors;
-    MatrixX Bt = rows.J.transpose() * rows.stiffness.cwiseSqrt().asDiagonal();
-    VectorX v = flatten(upstream);
-    for (int i = 0; i < zone.dynamic_count; ++i) {
-        factors.push_back(mass_matrix(zone.bodies[i]).llt().matrixL());
-        const auto L = factors.back().triangularView<Eigen::Lower>();
-        L.solveInPlace(v.segment<6>(6 * i));
-        if (m == 0) continue;
-        auto block = Bt.middleRows<6>(6 * i);
-        block = L.solve(block).eval();
+    VectorX v = free.flatten(upstream);
+    factor.solve_lower(v);
+    if (m > 0) {
+        MatrixX Bt = rows.J.transpose() * rows.stiffness.cwiseSqrt().asDiagonal();
+        factor.solve_lower(Bt);
+        const Eigen::ColPivHouseholderQR<MatrixX> qr(Bt);
+        const Eigen::Index rank = std::min(n, m);
+        const MatrixX R = qr.matrixR().topRows(rank).template triangularView<Eigen::Upper>();
+        VectorX projected = (qr.householderQ().transpose() * v).head(rank);
+        const MatrixX gram = MatrixX::Identity(rank, rank) + R * R.transpose();
+        VectorX correction = VectorX::Zero(n);
+        correction.head(rank) = projected - gram.llt().solve(projected);
+        v -= qr.householderQ() * correction;
     }
-    if (m == 0) {
-        for (int i = 0; i < zone.dynamic_count; ++i)
-            factors[static_cast<std::size_t>(i)].triangularView<Eigen::Lower>().transpose().solveInPlace(
-                v.segment<6>(6 * i));
-        return unflatten(v);
-    }
-    const Eigen::ColPivHouseholderQR<MatrixX> qr(Bt);
-    const Eigen::Index rank = std::min(n, m);
-    const MatrixX R = qr.matrixR().topRows(rank).template triangularView<Eigen::Upper>();
-    VectorX projected = (qr.householderQ().transpose() * v).head(rank);
-    const MatrixX gram = MatrixX::Identity(rank, rank) + R * R.transpose();
-    VectorX correction = VectorX::Zero(n);
-    correction.head(rank) = projected - gram.llt().solve(projected);
-    v -= qr.householderQ() * correction;
-    for (int i = 0; i < zone.dynamic_count; ++i)
-        factors[static_cast<std::size_t>(i)].triangularView<Eigen::Lower>().transpose().solveInPlace(
-            v.segment<6>(6 * i));
-    return unflatten(v);
+    factor.solve_upper(v);
+    return free.unflatten(v);
 }
 
 /// Hard contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
@@ -125,37 +302,65 @@ std::vector<double> harden(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const Solve& solve, Coordinates& z) {
     constexpr int kMaxSteps = 30;
     constexpr double kTolerance = 1e-14;  // on the change of z, relative: rounding
-    std::vector<ContactDerivatives> contacts;
-    for (const ActiveContact& active : point.active) contacts.push_back(derivatives_of(zone, point, active, false));
-    std::vector<double> reactions(contacts.size(), 0.0);
+    const ContactTermMaker make_term(zone, point);
+    std::vector<ContactTerm> terms;
+    for (const ActiveContact& active : point.active) terms.push_back(make_term(active, false));
+    std::vector<double> reactions(terms.size(), 0.0);
     for (int step = 0; step < kMaxSteps; ++step) {
         std::vector<double> next = reactions;
         Coordinates rhs = upstream;
-        for (std::size_t k = 0; k < contacts.size(); ++k) {
-            const ZoneContact& contact = zone.contacts[point.active[k].index];
-            const auto along = [&](int body, const Vec6& row) {
-                return body >= 0 && body < zone.dynamic_count ? row.dot(chart_jacobian(point.y[body]) * z[body]) : 0.0;
-            };
-            next[k] += contacts[k].stiffness *
-                       (along(contact.a, contacts[k].row.head<6>()) + along(contact.b, contacts[k].row.tail<6>()));
-            const auto react = [&](int body, const Vec6& row) {
-                if (body >= 0 && body < zone.dynamic_count)
-                    rhs[body] -= next[k] * (chart_jacobian(point.y[body]).transpose() * row);
-            };
-            react(contact.a, contacts[k].row.head<6>());
-            react(contact.b, contacts[k].row.tail<6>());
+        for (std::size_t k = 0; k < terms.size(); ++k) {
+            const ContactTerm& term = terms[k];
+            double along = 0.0;
+            term.for_each(
+                [&](int body, int offset) {
+                    if (zone.yields(body))
+                        along += term.row.segment<6>(offset).dot(chart_jacobian(point.y.bodies[body]) * z.bodies[body]);
+                },
+                [&](int node, int offset) { along += term.row.segment<3>(offset).dot(z.nodes[node]); });
+            next[k] += term.stiffness * along;
+            term.for_each(
+                [&](int body, int offset) {
+                    if (zone.yields(body))
+                        rhs.bodies[body] -=
+                            next[k] * (chart_jacobian(point.y.bodies[body]).transpose() * term.row.segment<6>(offset));
+                },
+                [&](int node, int offset) {
+                    if (!zone.nodes[node].pinned) rhs.nodes[node] -= next[k] * term.row.segment<3>(offset);
+                });
         }
         const Coordinates better = solve(rhs);
         double change = 0.0, size = 0.0;
-        for (std::size_t i = 0; i < z.size(); ++i) {
-            change = std::max(change, (better[i] - z[i]).norm());
-            size = std::max(size, better[i].norm());
-        }
+        const auto compare = [&](const auto& now, const auto& before) {
+            for (std::size_t i = 0; i < now.size(); ++i) {
+                change = std::max(change, (now[i] - before[i]).norm());
+                size = std::max(size, now[i].norm());
+            }
+        };
+        compare(better.bodies, z.bodies);
+        compare(better.nodes, z.nodes);
         z = better;
         reactions = next;
         if (change <= kTolerance * size) break;
     }
     return reactions;
+}
+
+/// What elasticity adds to the gradients: z times its second derivatives.
+void add_elasticity(const Zone& zone, const ZonePoint& point, ZoneAdjoint& result) {
+    const double scale = -zone.dt * zone.dt;
+    std::vector<Vec3> start;
+    for (const ZoneNode& node : zone.nodes) start.push_back(node.start);
+    for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
+        const ZoneCloth& part = zone.cloths[c];
+        const ClothParameters& parameters = (*zone.cloth_parameters)[part.id];
+        const Vec3* x = point.nodes.data() + part.first_node;
+        const Vec3* z = result.multiplier.nodes.data() + part.first_node;
+        Vec3* out = result.place_gradient.nodes.data() + part.first_node;
+        add_elastic_hessian_product(zone.cloth(c), parameters, zone.dt, part.start, x, z, scale, out);
+        result.cloth_gradient[static_cast<std::size_t>(c)] = add_elastic_backward(
+            zone.cloth(c), parameters, zone.dt, part.start, x, start.data() + part.first_node, z, scale, out);
+    }
 }
 
 }  // namespace
@@ -165,8 +370,11 @@ ZoneAdjoint zone_adjoint(
     const bool exact = mode == AdjointMode::exact;
     ZoneAdjoint result;
     ZoneDerivatives derivatives;
+    Coordinates free_upstream = upstream;
+    for (int i = 0; i < zone.node_count(); ++i)
+        if (zone.nodes[i].pinned) free_upstream.nodes[i].setZero();
     if (exact) {
-        system.set_pattern(zone.dynamic_count, zone.pairs);
+        system.set_pattern(base_pattern(zone));
         differentiate(zone, point, Curvature::exact, derivatives, &system);
         if (!system.factorize()) {
             // Only where the forward stopped short of a minimum. The projected Hessian keeps the answer finite.
@@ -174,55 +382,64 @@ ZoneAdjoint zone_adjoint(
             system.factorize();
         }
     }
-    const Rows rows = exact ? Rows{} : collect_rows(zone, point);
+    const FreeCoordinates free(zone);
+    const Rows rows = exact ? Rows{} : collect_rows(zone, point, free);
+    MatrixX cloth;
+    std::unique_ptr<InertiaFactor> factor;
+    if (!exact) {
+        cloth = cloth_matrix(zone, point, free, ElasticHessian::exact);
+        if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success)
+            cloth = cloth_matrix(zone, point, free, ElasticHessian::projected);
+        if (mode == AdjointMode::qr) factor = std::make_unique<InertiaFactor>(zone, cloth);
+    }
     const auto solve = [&](const Coordinates& rhs) {
-        if (mode == AdjointMode::dense) return solve_dense(zone, rows, rhs);
-        if (mode == AdjointMode::qr) return solve_qr(zone, rows, rhs);
+        if (mode == AdjointMode::dense) return solve_dense(zone, free, cloth, rows, rhs);
+        if (mode == AdjointMode::qr) return solve_qr(free, *factor, rows, rhs);
         Coordinates z = rhs;
         system.solve_in_place(z);
         return z;
     };
-    result.multiplier = solve(upstream);
+    result.multiplier = solve(free_upstream);
     const std::vector<double> reactions =
-        zone.hard ? harden(zone, point, upstream, solve, result.multiplier) : std::vector<double>();
+        zone.hard ? harden(zone, point, free_upstream, solve, result.multiplier) : std::vector<double>();
 
-    result.pose_gradient.assign(static_cast<std::size_t>(zone.body_count()), Vec6::Zero());
+    result.place_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
     result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
-    std::vector<Vec6> twist(static_cast<std::size_t>(zone.body_count()), Vec6::Zero());
+    result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
+    result.cloth_gradient.assign(zone.cloths.size(), ClothParameters{});
+    std::vector<Vec6> twist(zone.bodies.size(), Vec6::Zero());
     for (int i = 0; i < zone.dynamic_count; ++i) {
-        twist[i] = result.multiplier[i];
-        twist[i].head<3>() = left_jacobian(point.y[i].head<3>()) * result.multiplier[i].head<3>();
+        twist[i] = result.multiplier.bodies[i];
+        twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();
     }
+    const ContactTermMaker make_term(zone, point);
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
-        const ContactDerivatives d = derivatives_of(zone, point, active, exact);
-        double along;  // of the contact's gradient along the multiplier's twists
-        if (contact.contact.with_ground()) {
-            result.pose_gradient[contact.a] -= d.hessian.topLeftCorner<6, 6>() * twist[contact.a];
-            along = d.gradient.head<6>().dot(twist[contact.a]);
-            if (zone.hard) result.pose_gradient[contact.a] -= reactions[k] * d.row.head<6>();
-        } else {
-            Vec12 both;
-            both << twist[contact.a], twist[contact.b];
-            const Vec12 gradient = d.hessian * both;
-            result.pose_gradient[contact.a] -= gradient.head<6>();
-            result.pose_gradient[contact.b] -= gradient.tail<6>();
-            along = d.gradient.dot(both);
-            if (zone.hard) {
-                result.pose_gradient[contact.a] -= reactions[k] * d.row.head<6>();
-                result.pose_gradient[contact.b] -= reactions[k] * d.row.tail<6>();
-            }
-        }
+        const ContactTerm term = make_term(active, exact);
+        SmallVector motion = SmallVector::Zero(term.row.size());
+        term.for_each(
+            [&](int body, int offset) { motion.segment<6>(offset) = twist[body]; },
+            [&](int node, int offset) { motion.segment<3>(offset) = result.multiplier.nodes[node]; });
+        SmallVector gradient = term.hessian * motion;
+        if (zone.hard) gradient += reactions[k] * term.row;
+        term.for_each(
+            [&](int body, int offset) { result.place_gradient.bodies[body] -= gradient.segment<6>(offset); },
+            [&](int node, int offset) { result.place_gradient.nodes[node] -= gradient.segment<3>(offset); });
         if (zone.hard) continue;  // the stiffness is only how the multipliers were found
-        if (contact.a < zone.dynamic_count) result.mass_gradient[contact.a] -= along * contact.stiffness.log_gradient_a;
-        if (contact.b >= 0 && contact.b < zone.dynamic_count)
-            result.mass_gradient[contact.b] -= along * contact.stiffness.log_gradient_b;
+        const double along = term.gradient.dot(motion);
+        for (std::size_t s = 0; s < static_cast<std::size_t>(term.side_count); ++s) {
+            const double part = -along * (s == 0 ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b);
+            if (zone.yields(term.sides[s].body)) result.mass_gradient[term.sides[s].body] += part;
+            for (int node : term.sides[s].nodes)
+                if (node >= 0) result.node_mass_gradient[node] += part;
+        }
     }
+    if (!zone.cloths.empty() && zone.elastic) add_elasticity(zone, point, result);
     if (exact) {
         // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
         for (int i = 0; i < zone.dynamic_count; ++i)
-            result.pose_gradient[i].head<3>() -= 0.5 * skew(derivatives.torque[i]) * twist[i].head<3>();
+            result.place_gradient.bodies[i].head<3>() -= 0.5 * skew(derivatives.torque[i]) * twist[i].head<3>();
     }
     return result;
 }

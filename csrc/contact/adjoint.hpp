@@ -9,18 +9,22 @@
 ///  * exact: H is the energy's Hessian at the solution.
 ///  * dense: contacts are rows J of constant direction; the whole KKT system of Eq. 9, with the compliance as its
 ///    lower right block, by dense LU.
+///    Elasticity keeps its exact Hessian: only contacts are linearised.
 ///  * qr: the same linear system through the pivoted QR of (stiffness^½ J L⁻ᵀ)ᵀ, M = L Lᵀ, as in Eq. 13-15.
 namespace diffsim {
 
 struct ZoneAdjoint {
-    Coordinates multiplier;  ///< z, one per dynamic body
-    /// Through the contacts, one per body of the zone, those that do not yield included: gradient along the twist of
-    /// the body at the end of the step when its base pose moves.
-    std::vector<Vec6> pose_gradient;
-    std::vector<double> mass_gradient;  ///< through the contacts' stiffness, one per dynamic body
+    Coordinates multiplier;  ///< z, one per dynamic body and node; zero at pinned nodes
+    /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone, those
+    /// that do not yield included, along its twist at the end of the step; one per node.
+    Coordinates place_gradient;
+    std::vector<double> mass_gradient;            ///< through the contacts' stiffness, one per dynamic body
+    std::vector<double> node_mass_gradient;       ///< the same, one per node
+    std::vector<ClothParameters> cloth_gradient;  ///< through elasticity, one per cloth of the zone
 };
 
-/// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution.
+/// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution. `upstream` has one
+/// entry per dynamic body and node; those of pinned nodes are not used.
 ZoneAdjoint zone_adjoint(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, BlockSystem& system);
 

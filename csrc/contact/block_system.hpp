@@ -1,17 +1,35 @@
 #pragma once
 
+#include <array>
 #include <memory>
 #include <utility>
 #include <vector>
 
-#include "math/types.hpp"
+#include "contact/coordinates.hpp"
 
 namespace diffsim {
 
-/// A symmetric positive definite matrix of 6x6 blocks on the graph of a zone's bodies, and its factorization.
+using Mat63 = Eigen::Matrix<double, 6, 3>;
+using IndexPairs = std::vector<std::pair<int, int>>;
+
+/// Which blocks of a BlockSystem may be non-zero beside the diagonal. All lists sorted and unique.
+struct BlockPattern {
+    int body_count = 0, node_count = 0;
+    IndexPairs body_pairs;   ///< i < j
+    IndexPairs mixed_pairs;  ///< (body, node)
+    IndexPairs node_pairs;   ///< i < j
+
+    bool operator==(const BlockPattern& other) const {
+        return body_count == other.body_count && node_count == other.node_count && body_pairs == other.body_pairs &&
+               mixed_pairs == other.mixed_pairs && node_pairs == other.node_pairs;
+    }
+};
+
+/// A symmetric positive definite matrix on the graph of a zone's bodies (6 rows each) and cloth nodes (3 rows each), and
+/// its factorization.
 ///
-/// One body takes a 6x6 Cholesky factor, a few a dense one, many a sparse one with a fill-reducing order. The order
-/// of all sums is fixed by the pattern.
+/// One body takes a 6x6 Cholesky factor, a few a dense one, many, or nodes, a sparse one with a fill-reducing order. The
+/// order of all sums is fixed by the pattern.
 class BlockSystem {
 public:
     BlockSystem();
@@ -19,34 +37,47 @@ public:
     BlockSystem(BlockSystem&&) noexcept;
     BlockSystem& operator=(BlockSystem&&) noexcept;
 
-    /// Set the pattern: the number of bodies and the pairs (i < j, sorted, unique) with a block of their own.
-    void set_pattern(int body_count, std::vector<std::pair<int, int>> pairs);
-
-    int body_count() const { return m_body_count; }
-    const std::vector<std::pair<int, int>>& pairs() const { return m_pairs; }
+    void set_pattern(BlockPattern pattern);
+    const BlockPattern& pattern() const { return m_pattern; }
 
     void set_zero();
     Mat6& diagonal(int body) { return m_diagonal[body]; }
     const Mat6& diagonal(int body) const { return m_diagonal[body]; }
-    /// Block (i, j) of pair number `pair`.
+    /// Block (i, j) of body pair number `pair`.
     Mat6& off_diagonal(int pair) { return m_off_diagonal[pair]; }
     const Mat6& off_diagonal(int pair) const { return m_off_diagonal[pair]; }
+    Mat3& node_diagonal(int node) { return m_node_diagonal[node]; }
+    const Mat3& node_diagonal(int node) const { return m_node_diagonal[node]; }
+    /// Block (i, j) of node pair number `pair`.
+    Mat3& node_pair(int pair) { return m_node_pairs[pair]; }
+    const Mat3& node_pair(int pair) const { return m_node_pairs[pair]; }
+    /// Block (body, node) of mixed pair number `pair`.
+    Mat63& mixed_pair(int pair) { return m_mixed_pairs[pair]; }
+    const Mat63& mixed_pair(int pair) const { return m_mixed_pairs[pair]; }
+
+    /// Number of the pair in its list, or -1.
+    int find_node_pair(int i, int j) const;
+    int find_mixed_pair(int body, int node) const;
 
     /// False if the matrix is not positive definite.
     bool factorize();
     /// Overwrite the right-hand side by the solution. Needs a successful factorize().
-    void solve_in_place(std::vector<Vec6>& rhs) const;
+    void solve_in_place(Coordinates& rhs) const;
     /// out = matrix * in.
-    void multiply(const std::vector<Vec6>& in, std::vector<Vec6>& out) const;
+    void multiply(const Coordinates& in, Coordinates& out) const;
 
 private:
     struct SparseFactor;
+    bool is_sparse() const;
+    bool factorize_sparse();
 
-    int m_body_count = 0;
-    std::vector<std::pair<int, int>> m_pairs;
+    BlockPattern m_pattern;
     std::vector<Mat6> m_diagonal, m_off_diagonal;
-    Mat6 m_single;    // Cholesky factor of one body
-    MatrixX m_dense;  // Cholesky factor of a few
+    std::vector<Mat3> m_node_diagonal, m_node_pairs;
+    std::vector<Mat63> m_mixed_pairs;
+    std::vector<int> m_node_first, m_mixed_first;  // where the pairs of each node, of each body begin
+    Mat6 m_single;                                 // Cholesky factor of one body
+    MatrixX m_dense;                               // Cholesky factor of a few
     std::unique_ptr<SparseFactor> m_sparse;
     bool m_pattern_changed = true;
 };

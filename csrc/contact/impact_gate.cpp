@@ -28,15 +28,16 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
     });
     for (const Impact& impact : impacts) {
         const ZoneContact& contact = zone.contacts[impact.contact];
-        if (contact.contact.with_ground()) continue;  // there is no way around a half-space
+        if (contact.contact.with_ground()) continue;                 // there is no way around a half-space
+        if (contact.cloth_a >= 0 || contact.cloth_b >= 0) continue;  // cloth is led around things, and gives way
         const int a = contact.a, b = contact.b;
         const auto same = [&](const ImpactGate& gate) { return gate.a == a && gate.b == b; };
         if (std::any_of(gates.begin(), gates.end(), same)) continue;
         const double passing = kPassingPart * std::min(size(zone, a), size(zone, b));
-        const Vec6 relative = (y_end[a] - point.y[a]) - (y_end[b] - point.y[b]);
+        const Vec6 relative = (y_end.bodies[a] - point.y.bodies[a]) - (y_end.bodies[b] - point.y.bodies[b]);
         if (relative.tail<3>().norm() <= passing) continue;
-        const Vec6 y_a = point.y[a] + impact.toi * (y_end[a] - point.y[a]);
-        const Vec6 y_b = point.y[b] + impact.toi * (y_end[b] - point.y[b]);
+        const Vec6 y_a = point.y.bodies[a] + impact.toi * (y_end.bodies[a] - point.y.bodies[a]);
+        const Vec6 y_b = point.y.bodies[b] + impact.toi * (y_end.bodies[b] - point.y.bodies[b]);
         const ContactGeometry geometry = contact_geometry(
             *zone.model, contact.contact, pose_at(zone.bodies[a], y_a), pose_at(zone.bodies[b], y_b),
             zone.ground_height);
@@ -49,8 +50,8 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
 
 bool gates_hold(const std::vector<ImpactGate>& gates, const Zone& zone, const Coordinates& y) {
     return std::all_of(gates.begin(), gates.end(), [&](const ImpactGate& gate) {
-        const Vec3 x_a = pose_at(zone.bodies[gate.a], y[gate.a]) * gate.point_a;
-        const Vec3 x_b = pose_at(zone.bodies[gate.b], y[gate.b]) * gate.point_b;
+        const Vec3 x_a = pose_at(zone.bodies[gate.a], y.bodies[gate.a]) * gate.point_a;
+        const Vec3 x_b = pose_at(zone.bodies[gate.b], y.bodies[gate.b]) * gate.point_b;
         return gate.normal.dot(x_a - x_b) >= -gate.allowed_passing;
     });
 }

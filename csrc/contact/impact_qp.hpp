@@ -6,18 +6,35 @@ namespace diffsim {
 
 /// A linearised contact: gap + rowᵀ p should reach a distance. Half-spaces with a penalty, see solve_impact_qp.
 struct ImpactRow {
-    int a, b;  ///< bodies of the zone; -1 where one does not yield
-    int pair;  ///< block of the Hessian, or -1
-    Vec6 row_a, row_b;
-    double missing;    ///< what p has to make up for: violated by max(0, missing - rowᵀ p) [m]
-    double stiffness;  ///< [kg]
+    int a = -1, b = -1;  ///< bodies of the zone; -1 where one does not yield or is none
+    int pair = -1;       ///< block of the Hessian, or -1
+    Vec6 row_a = Vec6::Zero(), row_b = Vec6::Zero();
+    int node_count = 0;  ///< free nodes that take part
+    std::array<int, 6> nodes = {};
+    std::array<Vec3, 6> node_rows;
+    double missing = 0.0;    ///< what p has to make up for: violated by max(0, missing - rowᵀ p) [m]
+    double stiffness = 0.0;  ///< [kg]
 };
 
-/// min over p of ½ pᵀ S M p + gᵀ p + Σ stiffness/2 max(0, missing - rowᵀ p)², by Newton's method on this piecewise
-/// quadratic with exact line search. S scales each body's mass by `mass_factor`. `p` holds the start and receives the
-/// minimiser. Scratch: `system`. Returns the number of Newton steps.
+/// Everything at some coordinates.
+struct Placement {
+    Coordinates y;
+    std::vector<Pose> poses;
+    std::vector<Vec3> nodes;
+};
+
+/// The row that asks for a distance, linearised where the objects are placed, for p counted from y_now. What moves as
+/// told does its part.
+ImpactRow make_row(
+    const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const Placement& at,
+    const Coordinates& y_now, double wanted);
+
+/// min over p of ½ pᵀ A p + gᵀ p + Σ stiffness/2 max(0, missing - rowᵀ p)², by Newton's method on this piecewise
+/// quadratic with exact line search. A is diagonal for bodies, their masses scaled by `mass_factor`, and `cloth` for nodes.
+/// `p` holds the start, which pinned nodes keep, and receives the minimiser. Scratch: `system`, whose pattern has the
+/// rows' pairs. Returns the number of Newton steps.
 int solve_impact_qp(
-    const Zone& zone, const Coordinates& inertial_gradient, const std::vector<double>& mass_factor,
+    const Zone& zone, const Coordinates& gradient, const std::vector<double>& mass_factor, const BlockSystem* cloth,
     const std::vector<ImpactRow>& rows, BlockSystem& system, Coordinates& p);
 
 struct ImpactDirection {

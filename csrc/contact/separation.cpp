@@ -32,6 +32,12 @@ SignedGap signed_gap(const Zone& zone, const ZoneContact& contact, const Contact
         return {true, geometry.distance, geometry.normal};
     const Contact& c = contact.contact;
     const ClosestPoints& closest = geometry.closest;
+    if (contact.cloth_a >= 0 || contact.cloth_b >= 0) {
+        // Cloth has no inside: where it is too near to tell the side, only a body's face can.
+        if (contact.cloth_a >= 0 || c.type != ContactType::patch_vertex || closest.slide_count_a != 2) return result;
+        const Vec3 normal = -outward(zone.mesh(contact.a), zone.bodies[contact.a].start, c.feature_a, true);
+        return {!normal.isZero(0.0), normal.dot(closest.point_a - closest.point_b), normal};
+    }
     const Pose &pose_a = zone.bodies[contact.a].start, &pose_b = zone.bodies[contact.b].start;
     const CollisionMesh &mesh_a = zone.mesh(contact.a), &mesh_b = zone.mesh(contact.b);
     const Vec3 offset = closest.point_a - closest.point_b;
@@ -61,57 +67,66 @@ SignedGap signed_gap(const Zone& zone, const ZoneContact& contact, const Contact
 }  // namespace
 
 Separation separate(Zone zone, const PassiveBodies& passive) {
-    const std::size_t count = static_cast<std::size_t>(zone.dynamic_count);
+    const std::size_t count = static_cast<std::size_t>(zone.dynamic_count), node_count = zone.nodes.size();
     std::vector<Mat3> inertia_body(count);
     for (std::size_t i = 0; i < count; ++i)
         inertia_body[i] = zone.bodies[i].start.R.transpose() * zone.bodies[i].inertia * zone.bodies[i].start.R;
     const std::vector<double> mass_factor(count, 1.0);
     Separation result;
     ZonePoint point;
-    BlockSystem system;
+    BlockSystem system, cloth;
+    Coordinates zero;
+    zero.assign_zero(count, node_count);
+    for (ZoneBody& body : zone.bodies) body.target.setZero();
+    for (ZoneNode& node : zone.nodes) node.target.setZero();
+    zone.elastic = false;  // it takes too little to strain anything
     for (int round = 0; round < kMaxRounds; ++round) {
         zone.bodies.resize(count);
-        Coordinates begin(count, Vec6::Zero()), end(count, Vec6::Zero());
-        for (ZoneBody& body : zone.bodies) body.target.setZero();
+        Coordinates begin = zero, end = zero;
         collect_contacts(zone, passive, begin, end);
+        Placement at;
+        at.y = begin;
+        place(zone, at.y, at.poses, at.nodes);
         std::vector<ImpactRow> rows;
+        std::vector<int> row_contacts;
         bool complete = true;
-        for (const ZoneContact& contact : zone.contacts) {
-            const bool ground = contact.contact.with_ground();
-            const Pose& pose_a = zone.bodies[contact.a].start;
-            const Pose& pose_b = ground ? pose_a : zone.bodies[contact.b].start;
-            const ContactGeometry geometry =
-                contact_geometry(*zone.model, contact.contact, pose_a, pose_b, zone.ground_height);
+        for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
+            const ZoneContact& contact = zone.contacts[k];
+            ContactGeometry geometry = contact_geometry(
+                contact.contact, surface_a(zone, contact, at.poses, at.nodes),
+                surface_b(zone, contact, at.poses, at.nodes), zone.ground_height);
             const double depth = contact.range.rest - contact.range.floor;
             if (!(geometry.distance < contact.range.rest - kAccepted * depth) || geometry.sine_sq == 0.0) continue;
             complete = false;
             const SignedGap gap = signed_gap(zone, contact, geometry, round >= kRoundsBeforeGuesses);
             if (!gap.valid) continue;
-            ContactGeometry oriented = geometry;
-            oriented.normal = gap.normal;
-            const Vec12 row = distance_gradient(oriented, pose_a.t, pose_b.t);
-            ImpactRow entry;
-            entry.a = contact.a < zone.dynamic_count ? contact.a : -1;
-            entry.b = !ground && contact.b < zone.dynamic_count ? contact.b : -1;
-            entry.pair = contact.pair;
-            entry.row_a = row.head<6>();
-            entry.row_b = row.tail<6>();
-            entry.missing = contact.range.rest + kClearance * depth - gap.gap;
-            entry.stiffness = contact.stiffness.value;
-            rows.push_back(entry);
+            geometry.normal = gap.normal;
+            geometry.distance = gap.gap;
+            rows.push_back(make_row(zone, contact, geometry, at, begin, contact.range.rest + kClearance * depth));
+            row_contacts.push_back(static_cast<int>(k));
         }
         result.complete = complete;
         if (complete) break;
-        system.set_pattern(zone.dynamic_count, zone.pairs);
-        Coordinates p(count, Vec6::Zero());
-        solve_impact_qp(zone, Coordinates(count, Vec6::Zero()), mass_factor, rows, system, p);
+        system.set_pattern(base_pattern(zone));
+        ensure_pattern(zone, row_contacts, system);
+        if (node_count > 0) {
+            BlockPattern pattern;
+            pattern.node_count = zone.node_count();
+            cloth.set_pattern(pattern);
+            for (int i = 0; i < zone.node_count(); ++i)
+                cloth.node_diagonal(i) = (zone.nodes[i].pinned ? 1.0 : zone.nodes[i].mass) * Mat3::Identity();
+        }
+        Coordinates p = zero;
+        solve_impact_qp(zone, zero, mass_factor, node_count > 0 ? &cloth : nullptr, rows, system, p);
         for (std::size_t i = 0; i < count; ++i) {
             ZoneBody& body = zone.bodies[i];
-            body.start = pose_at(body, p[i]);
+            body.start = pose_at(body, p.bodies[i]);
             body.inertia = body.start.R * inertia_body[i] * body.start.R.transpose();
         }
+        for (std::size_t i = 0; i < node_count; ++i) zone.nodes[i].start += p.nodes[i];
     }
     for (std::size_t i = 0; i < count; ++i) result.poses.push_back(zone.bodies[i].start);
+    for (const ZoneNode& node : zone.nodes) result.nodes.push_back(node.start);
     return result;
 }
 

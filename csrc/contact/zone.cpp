@@ -3,6 +3,7 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "math/rotation.hpp"
 
@@ -21,7 +22,7 @@ double scaled_norm(const ZoneBody& body, const Vec6& gradient) {
     return std::sqrt(turn.dot(body.inverse_inertia * turn) + gradient.tail<3>().squaredNorm() / body.mass);
 }
 
-/// Adds up the contacts' derivatives along the bodies' twists.
+/// Adds up the contacts' derivatives along the bodies' twists and the nodes.
 class Assembler {
 public:
     Assembler(const Zone& zone, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system)
@@ -29,62 +30,131 @@ public:
 
     void add(const ZonePoint& point, const ActiveContact& active) {
         const ZoneContact& contact = m_zone.contacts[active.index];
-        const Vec3& center_a = point.poses[contact.a].t;
-        const double stiffness = contact.stiffness.value;
         if (contact.contact.with_ground()) {
-            const GroundDerivatives d = ground_derivatives(
-                active.geometry.distance, active.geometry.closest.point_a - center_a, contact.range, stiffness,
-                m_curvature != Curvature::dropped);
-            add_body(contact.a, d.row, -d.force * d.row, d.force, d.stiffness, d.hessian);
-            return;
-        }
-        const ContactDerivatives d = contact_derivatives(
-            active.geometry, contact.range, stiffness, center_a, point.poses[contact.b].t, m_system != nullptr,
-            m_curvature != Curvature::dropped);
-        const bool yields_a = contact.a < m_zone.dynamic_count, yields_b = contact.b < m_zone.dynamic_count;
-        if (yields_a && yields_b && m_curvature == Curvature::projected) {
-            const Mat12 hessian = positive_part<12>(d.hessian);
-            add_pair(contact, d, hessian);
-            return;
-        }
-        if (yields_a && yields_b) {
-            add_pair(contact, d, d.hessian);
-        } else if (yields_a) {
-            add_body(
-                contact.a, d.row.head<6>(), d.gradient.head<6>(), d.force, d.stiffness,
-                d.hessian.topLeftCorner<6, 6>());
+            if (contact.cloth_a >= 0)
+                add_node_on_ground(contact, active);
+            else
+                add_body_on_ground(point, contact, active);
+        } else if (contact.cloth_a >= 0) {
+            add_pair(contact, active, cloth_on(point, contact, active, true), cloth_on(point, contact, active, false));
+        } else if (contact.cloth_b >= 0) {
+            add_pair(contact, active, body_on(point, contact.a), cloth_on(point, contact, active, false));
         } else {
-            add_body(
-                contact.b, d.row.tail<6>(), d.gradient.tail<6>(), d.force, d.stiffness,
-                d.hessian.bottomRightCorner<6, 6>());
+            add_pair(contact, active, body_on(point, contact.a), body_on(point, contact.b));
         }
     }
 
 private:
-    void add_gradient(int body, const Vec6& row, const Vec6& gradient, double force, double stiffness) {
-        m_derivatives.gradient[body] += gradient;
-        const double scale = scaled_norm(m_zone.bodies[body], row);
+    /// A side of a contact and where its derivatives go.
+    struct BodyPlace : BodySide {
+        int body;
+    };
+    struct ClothPlace : ClothSide {
+        std::array<int, 3> nodes;
+    };
+
+    static BodyPlace body_on(const ZonePoint& point, int body) { return {{point.poses[body].t}, body}; }
+    ClothPlace cloth_on(
+        const ZonePoint& point, const ZoneContact& contact, const ActiveContact& active, bool of_a) const {
+        const Surface surface = of_a ? surface_a(m_zone, contact, point.poses, point.nodes)
+                                     : surface_b(m_zone, contact, point.poses, point.nodes);
+        return {cloth_side(contact.contact, active.geometry, surface, of_a), feature_nodes(m_zone, contact, of_a)};
+    }
+
+    bool yields(const BodyPlace& place) const { return m_zone.yields(place.body); }
+    static bool yields(const ClothPlace&) { return true; }
+
+    void add_gradient(const BodyPlace& place, const Vec6& row, const Vec6& gradient, double force, double stiffness) {
+        m_derivatives.gradient.bodies[place.body] += gradient;
+        note_scale(scaled_norm(m_zone.bodies[place.body], row), force, stiffness);
+    }
+    void add_gradient(
+        const ClothPlace& place, const Vector<9>& row, const Vector<9>& gradient, double force, double stiffness) {
+        for (int k = 0; k < 3; ++k) {
+            const int node = place.nodes[k];
+            if (node < 0 || m_zone.nodes[node].pinned) continue;
+            m_derivatives.gradient.nodes[node] += gradient.segment<3>(3 * k);
+            note_scale(row.segment<3>(3 * k).norm() / std::sqrt(m_zone.nodes[node].mass), force, stiffness);
+        }
+    }
+    void note_scale(double scale, double force, double stiffness) {
         m_derivatives.largest_force = std::max(m_derivatives.largest_force, force * scale);
         m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, stiffness * scale);
     }
 
-    void add_body(
-        int body, const Vec6& row, const Vec6& gradient, double force, double stiffness, const Mat6& hessian) {
-        add_gradient(body, row, gradient, force, stiffness);
-        if (m_system == nullptr) return;
-        m_system->diagonal(body) += m_curvature == Curvature::projected ? positive_part<6>(hessian) : hessian;
+    void add_block(const BodyPlace& place, const Mat6& block) { m_system->diagonal(place.body) += block; }
+    void add_block(const ClothPlace& place, const Square<9>& block) {
+        for (int r = 0; r < 3; ++r)
+            for (int c = r; c < 3; ++c)
+                if (place.nodes[r] >= 0 && place.nodes[c] >= 0)
+                    add_node_block(m_zone, place.nodes[r], place.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
+    }
+    void add_cross(const ZoneContact& contact, const BodyPlace& a, const BodyPlace& b, const Mat6& block) {
+        if (a.body < b.body)
+            m_system->off_diagonal(contact.pair) += block;
+        else
+            m_system->off_diagonal(contact.pair) += block.transpose();
+    }
+    void add_cross(
+        const ZoneContact&, const BodyPlace& a, const ClothPlace& b, const Eigen::Matrix<double, 6, 9>& block) {
+        for (int k = 0; k < 3; ++k)
+            if (b.nodes[k] >= 0 && !m_zone.nodes[b.nodes[k]].pinned)
+                m_system->mixed_pair(m_system->find_mixed_pair(a.body, b.nodes[k])) += block.middleCols<3>(3 * k);
+    }
+    void add_cross(const ZoneContact&, const ClothPlace& a, const ClothPlace& b, const Square<9>& block) {
+        for (int r = 0; r < 3; ++r)
+            for (int c = 0; c < 3; ++c)
+                if (a.nodes[r] >= 0 && b.nodes[c] >= 0)
+                    add_node_block(m_zone, a.nodes[r], b.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
     }
 
-    void add_pair(const ZoneContact& contact, const ContactDerivatives& d, const Mat12& hessian) {
-        add_gradient(contact.a, d.row.head<6>(), d.gradient.head<6>(), d.force, d.stiffness);
-        add_gradient(contact.b, d.row.tail<6>(), d.gradient.tail<6>(), d.force, d.stiffness);
+    template <class A, class B>
+    void add_pair(const ZoneContact& contact, const ActiveContact& active, const A& a, const B& b) {
+        constexpr int kA = A::kSize, kB = B::kSize;
+        const ContactDerivatives<kA + kB> d = contact_derivatives(
+            active.geometry, contact.range, contact.stiffness.value, base(a), base(b), m_system != nullptr,
+            m_curvature != Curvature::dropped);
+        if (yields(a)) add_gradient(a, d.row.template head<kA>(), d.gradient.template head<kA>(), d.force, d.stiffness);
+        if (yields(b)) add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
         if (m_system == nullptr) return;
-        m_system->diagonal(contact.a) += hessian.topLeftCorner<6, 6>();
-        m_system->diagonal(contact.b) += hessian.bottomRightCorner<6, 6>();
-        if (contact.a < contact.b)
-            m_system->off_diagonal(contact.pair) += hessian.topRightCorner<6, 6>();
-        else
-            m_system->off_diagonal(contact.pair) += hessian.bottomLeftCorner<6, 6>();
+        if (yields(a) && yields(b)) {
+            const Square<kA + kB> hessian = positive(d.hessian);
+            add_block(a, hessian.template topLeftCorner<kA, kA>());
+            add_block(b, hessian.template bottomRightCorner<kB, kB>());
+            add_cross(contact, a, b, hessian.template topRightCorner<kA, kB>());
+        } else if (yields(a)) {
+            add_block(a, positive(Square<kA>(d.hessian.template topLeftCorner<kA, kA>())));
+        } else if (yields(b)) {
+            add_block(b, positive(Square<kB>(d.hessian.template bottomRightCorner<kB, kB>())));
+        }
+    }
+
+    static const BodySide& base(const BodyPlace& place) { return place; }
+    static const ClothSide& base(const ClothPlace& place) { return place; }
+
+    template <int N>
+    Square<N> positive(const Square<N>& hessian) const {
+        return m_curvature == Curvature::projected ? positive_part<N>(hessian) : hessian;
+    }
+
+    void add_body_on_ground(const ZonePoint& point, const ZoneContact& contact, const ActiveContact& active) {
+        const Vec3 arm = active.geometry.closest.point_a - point.poses[contact.a].t;
+        const GroundDerivatives d = ground_derivatives(
+            active.geometry.distance, arm, contact.range, contact.stiffness.value, m_curvature != Curvature::dropped);
+        const BodyPlace place{{point.poses[contact.a].t}, contact.a};
+        add_gradient(place, d.row, -d.force * d.row, d.force, d.stiffness);
+        if (m_system != nullptr) add_block(place, positive(d.hessian));
+    }
+
+    void add_node_on_ground(const ZoneContact& contact, const ActiveContact& active) {
+        const int node = feature_nodes(m_zone, contact, true)[0];
+        if (m_zone.nodes[node].pinned) return;
+        const PotentialValue potential = contact_potential(
+            contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
+            contact.stiffness.value);
+        m_derivatives.gradient.nodes[node].z() -= potential.force;
+        note_scale(1.0 / std::sqrt(m_zone.nodes[node].mass), potential.force, potential.stiffness);
+        if (m_system != nullptr) m_system->node_diagonal(node)(2, 2) += potential.stiffness;
     }
 
     const Zone& m_zone;
@@ -93,19 +163,105 @@ private:
     BlockSystem* m_system;
 };
 
+void sort_unique(IndexPairs& pairs) {
+    std::sort(pairs.begin(), pairs.end());
+    pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
+}
+
+/// Inertia and elasticity of cloth: gradient and, if asked for, Hessian.
+void add_cloth(
+    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system) {
+    const double scale = zone.dt * zone.dt;
+    std::vector<Vec3>& gradient = derivatives.gradient.nodes;
+    if (zone.elastic) {
+        for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
+            const ZoneCloth& cloth = zone.cloths[c];
+            add_elastic_gradient(
+                zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start,
+                point.nodes.data() + cloth.first_node, scale, gradient.data() + cloth.first_node);
+        }
+        if (system != nullptr) {
+            const ElasticHessian kind =
+                curvature == Curvature::projected ? ElasticHessian::projected : ElasticHessian::exact;
+            add_elastic_hessian(zone, point, kind, *system);
+        }
+    }
+    for (int i = 0; i < zone.node_count(); ++i) {
+        const ZoneNode& node = zone.nodes[i];
+        if (node.pinned)
+            gradient[i].setZero();
+        else
+            gradient[i] += node.mass * (point.y.nodes[i] - node.target);
+        if (system == nullptr) continue;
+        Mat3& block = system->node_diagonal(i);
+        if (node.pinned) {
+            block.setIdentity();
+            continue;
+        }
+        derivatives.largest_stiffness = std::max(derivatives.largest_stiffness, block.trace() / std::sqrt(node.mass));
+        block.diagonal().array() += node.mass;
+    }
+}
+
 }  // namespace
+
+void add_node_block(const Zone& zone, int i, int j, const Mat3& block, BlockSystem& system) {
+    if (zone.nodes[i].pinned || zone.nodes[j].pinned) return;
+    if (i == j)
+        system.node_diagonal(i) += block;
+    else if (i < j)
+        system.node_pair(system.find_node_pair(i, j)) += block;
+    else
+        system.node_pair(system.find_node_pair(j, i)) += block.transpose();
+}
 
 Pose pose_at(const ZoneBody& body, const Vec6& y) {
     if (y.isZero(0.0)) return body.start;
     return {exp_rotation(y.head<3>()) * body.start.R, body.start.t + y.tail<3>()};
 }
 
+void clear(Zone& zone) {
+    zone.bodies.clear();
+    zone.nodes.clear();
+    zone.cloths.clear();
+    zone.contacts.clear();
+    zone.pairs.clear();
+    zone.dynamic_count = 0;
+}
+
+Surface surface_a(
+    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes) {
+    if (contact.cloth_a >= 0)
+        return {&zone.cloth(contact.cloth_a).surface, nullptr, nodes.data() + zone.cloths[contact.cloth_a].first_node};
+    return {&zone.mesh(contact.a), &poses[contact.a], nullptr};
+}
+
+Surface surface_b(
+    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes) {
+    if (contact.contact.with_ground()) return {};
+    if (contact.cloth_b >= 0)
+        return {&zone.cloth(contact.cloth_b).surface, nullptr, nodes.data() + zone.cloths[contact.cloth_b].first_node};
+    return {&zone.mesh(contact.b), &poses[contact.b], nullptr};
+}
+
+std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, bool of_a) {
+    const int cloth = of_a ? contact.cloth_a : contact.cloth_b;
+    std::array<int, 3> nodes = feature_vertices(zone.cloth(cloth).surface, contact.contact, of_a);
+    for (int& node : nodes)
+        if (node >= 0) node += zone.cloths[cloth].first_node;
+    return nodes;
+}
+
 void rescue_contacts(Zone& zone) {
+    std::vector<Pose> poses;
+    std::vector<Vec3> nodes;
+    for (const ZoneBody& body : zone.bodies) poses.push_back(body.start);
+    for (const ZoneNode& node : zone.nodes) nodes.push_back(node.start);
     for (ZoneContact& contact : zone.contacts) {
-        const Pose& pose_a = zone.bodies[contact.a].start;
-        const Pose& pose_b = contact.contact.with_ground() ? pose_a : zone.bodies[contact.b].start;
-        const double distance =
-            contact_geometry(*zone.model, contact.contact, pose_a, pose_b, zone.ground_height).distance;
+        const double distance = contact_geometry(
+                                    contact.contact, surface_a(zone, contact, poses, nodes),
+                                    surface_b(zone, contact, poses, nodes), zone.ground_height)
+                                    .distance;
         contact.range = rescued_range(contact.range, distance);
     }
 }
@@ -124,63 +280,159 @@ Mat3 chart_curvature(const Vec6& y, const Vec3& torque) {
     return 0.5 * (full + full.transpose());
 }
 
+void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std::vector<Vec3>& nodes) {
+    poses.resize(zone.bodies.size());
+    for (std::size_t i = 0; i < zone.bodies.size(); ++i) poses[i] = pose_at(zone.bodies[i], y.bodies[i]);
+    nodes.resize(zone.nodes.size());
+    for (std::size_t i = 0; i < zone.nodes.size(); ++i) nodes[i] = zone.nodes[i].start + y.nodes[i];
+}
+
 void evaluate(const Zone& zone, ZonePoint& point) {
-    const int count = zone.body_count();
-    point.poses.resize(static_cast<std::size_t>(count));
+    place(zone, point.y, point.poses, point.nodes);
     double inertial = 0.0;
-    for (int i = 0; i < count; ++i) {
+    for (int i = 0; i < zone.dynamic_count; ++i) {
         const ZoneBody& body = zone.bodies[i];
-        point.poses[i] = pose_at(body, point.y[i]);
-        if (i >= zone.dynamic_count) continue;
-        const Vec6 error = point.y[i] - body.target;
+        const Vec6 error = point.y.bodies[i] - body.target;
         inertial +=
             0.5 * (error.head<3>().dot(body.inertia * error.head<3>()) + body.mass * error.tail<3>().squaredNorm());
+    }
+    for (int i = 0; i < zone.node_count(); ++i) {
+        const ZoneNode& node = zone.nodes[i];
+        if (!node.pinned) inertial += 0.5 * node.mass * (point.y.nodes[i] - node.target).squaredNorm();
+    }
+    point.elastic_energy = 0.0;
+    if (zone.elastic) {
+        for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
+            const ZoneCloth& cloth = zone.cloths[c];
+            point.elastic_energy += zone.dt * zone.dt *
+                                    elastic_energy(
+                                        zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start,
+                                        point.nodes.data() + cloth.first_node);
+        }
     }
     point.distances.resize(zone.contacts.size());
     point.active.clear();
     point.contact_energy = 0.0;
-    static const Pose kNoPose;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
-        if (contact.contact.with_ground()) {
-            const Pose& pose = point.poses[contact.a];
-            const Vec3& x = zone.mesh(contact.a).vertices[contact.contact.feature_a];
-            const double height = pose.R.row(2).dot(x) + pose.t.z() - zone.ground_height;
+        const Surface a = surface_a(zone, contact, point.poses, point.nodes);
+        if (contact.contact.with_ground() && a.nodes == nullptr) {
+            const Pose& pose = *a.pose;
+            const double height =
+                pose.R.row(2).dot(a.mesh->vertices[contact.contact.feature_a]) + pose.t.z() - zone.ground_height;
             point.distances[k] = height;
             if (!(height < contact.range.rest)) continue;
         }
-        const Pose& pose_b = contact.contact.with_ground() ? kNoPose : point.poses[contact.b];
-        const ContactGeometry geometry =
-            contact_geometry(*zone.model, contact.contact, point.poses[contact.a], pose_b, zone.ground_height);
+        const ContactGeometry geometry = contact_geometry(
+            contact.contact, a, surface_b(zone, contact, point.poses, point.nodes), zone.ground_height);
         point.distances[k] = geometry.distance;
         // Exactly parallel edges carry no energy and have no closest points: vertex-patch pairs act there.
         if (!(geometry.distance < contact.range.rest) || geometry.sine_sq == 0.0) continue;
         point.contact_energy += contact_energy(geometry, contact.range, contact.stiffness.value);
         point.active.push_back({static_cast<int>(k), geometry});
     }
-    point.energy = inertial + point.contact_energy;
+    point.energy = inertial + point.elastic_energy + point.contact_energy;
+}
+
+BlockPattern base_pattern(const Zone& zone) {
+    BlockPattern pattern;
+    pattern.body_count = zone.dynamic_count;
+    pattern.node_count = zone.node_count();
+    pattern.body_pairs = zone.pairs;
+    if (!zone.elastic) return pattern;
+    for (std::size_t c = 0; c < zone.cloths.size(); ++c) {
+        const int first = zone.cloths[c].first_node;
+        for (const auto& [i, j] : zone.cloth(static_cast<int>(c)).node_pairs)
+            pattern.node_pairs.emplace_back(first + i, first + j);
+    }
+    return pattern;
+}
+
+void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSystem& system) {
+    if (zone.nodes.empty()) return;
+    IndexPairs mixed, nodes;
+    const auto couple = [&](int i, int j) {
+        if (zone.nodes[i].pinned || zone.nodes[j].pinned) return;
+        const std::pair<int, int> pair(std::min(i, j), std::max(i, j));
+        if (system.find_node_pair(pair.first, pair.second) < 0) nodes.push_back(pair);
+    };
+    for (int index : contacts) {
+        const ZoneContact& contact = zone.contacts[index];
+        if (contact.contact.with_ground() || contact.cloth_b < 0) continue;
+        std::array<int, 6> touched;
+        int count = 0;
+        for (bool of_a : {true, false}) {
+            if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) continue;
+            for (int node : feature_nodes(zone, contact, of_a))
+                if (node >= 0) touched[static_cast<std::size_t>(count++)] = node;
+        }
+        for (int i = 0; i < count; ++i) {
+            const int node = touched[static_cast<std::size_t>(i)];
+            for (int j = i + 1; j < count; ++j) couple(node, touched[static_cast<std::size_t>(j)]);
+            if (zone.yields(contact.a) && !zone.nodes[node].pinned && system.find_mixed_pair(contact.a, node) < 0)
+                mixed.emplace_back(contact.a, node);
+        }
+    }
+    if (mixed.empty() && nodes.empty()) return;
+    BlockPattern pattern = system.pattern();
+    const auto merge = [](IndexPairs& into, IndexPairs& more) {
+        sort_unique(more);
+        IndexPairs merged;
+        merged.reserve(into.size() + more.size());
+        std::merge(into.begin(), into.end(), more.begin(), more.end(), std::back_inserter(merged));
+        into = std::move(merged);
+    };
+    merge(pattern.mixed_pairs, mixed);
+    merge(pattern.node_pairs, nodes);
+    system.set_pattern(std::move(pattern));
+}
+
+void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessian kind, BlockSystem& system) {
+    const double scale = zone.dt * zone.dt;
+    for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
+        const ZoneCloth& cloth = zone.cloths[c];
+        const int first = cloth.first_node;
+        visit_elastic_hessian(
+            zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start, point.nodes.data() + first, kind,
+            [&](const auto& element) {
+                const int count = static_cast<int>(element.nodes.size());
+                for (int r = 0; r < count; ++r)
+                    for (int s = r; s < count; ++s)
+                        add_node_block(
+                            zone, first + element.nodes[static_cast<std::size_t>(r)],
+                            first + element.nodes[static_cast<std::size_t>(s)], scale * element.block(r, s), system);
+            });
+    }
 }
 
 void differentiate(
     const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system) {
     const int count = zone.dynamic_count;
-    derivatives.gradient.assign(static_cast<std::size_t>(count), Vec6::Zero());
+    derivatives.gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     derivatives.torque.resize(static_cast<std::size_t>(count));
     derivatives.largest_force = derivatives.largest_stiffness = 0.0;
     if (curvature == Curvature::none) system = nullptr;
-    if (system != nullptr) system->set_zero();
+    if (system != nullptr) {
+        if (!zone.nodes.empty()) {
+            std::vector<int> indices;
+            for (const ActiveContact& active : point.active) indices.push_back(active.index);
+            ensure_pattern(zone, indices, *system);
+        }
+        system->set_zero();
+    }
     Assembler assembler(zone, curvature, derivatives, system);
     for (const ActiveContact& active : point.active) assembler.add(point, active);
 
     // From twists to coordinates. Bodies that have not turned and carry no torque need no change of chart.
     for (int i = 0; i < count; ++i) {
         const ZoneBody& body = zone.bodies[i];
-        const Vec6 error = point.y[i] - body.target;
-        Vec6& gradient = derivatives.gradient[i];
+        const Vec6& y = point.y.bodies[i];
+        const Vec6 error = y - body.target;
+        Vec6& gradient = derivatives.gradient.bodies[i];
         derivatives.torque[i] = gradient.head<3>();
-        const bool turned = !point.y[i].head<3>().isZero(0.0);
+        const bool turned = !y.head<3>().isZero(0.0);
         if (turned) {
-            const Mat3 J = left_jacobian(point.y[i].head<3>());
+            const Mat3 J = left_jacobian(y.head<3>());
             gradient.head<3>() = J.transpose() * derivatives.torque[i];
             if (system != nullptr) {
                 Mat6& block = system->diagonal(i);
@@ -193,18 +445,25 @@ void differentiate(
         if (system == nullptr) continue;
         Mat6& block = system->diagonal(i);
         if (turned && curvature != Curvature::dropped && !derivatives.torque[i].isZero(0.0)) {
-            const Mat3 extra = chart_curvature(point.y[i], derivatives.torque[i]);
+            const Mat3 extra = chart_curvature(y, derivatives.torque[i]);
             block.topLeftCorner<3, 3>() += curvature == Curvature::projected ? positive_part<3>(extra) : extra;
         }
         block.topLeftCorner<3, 3>() += body.inertia;
         block.diagonal().tail<3>().array() += body.mass;
     }
+    if (!zone.nodes.empty()) add_cloth(zone, point, curvature, derivatives, system);
     if (system == nullptr) return;
-    for (int k = 0; k < static_cast<int>(zone.pairs.size()); ++k) {
-        const auto [i, j] = zone.pairs[k];
+    const BlockPattern& pattern = system->pattern();
+    for (int k = 0; k < static_cast<int>(pattern.body_pairs.size()); ++k) {
+        const auto [i, j] = pattern.body_pairs[k];
         Mat6& block = system->off_diagonal(k);
-        block.topRows<3>() = left_jacobian(point.y[i].head<3>()).transpose() * block.topRows<3>().eval();
-        block.leftCols<3>() = block.leftCols<3>().eval() * left_jacobian(point.y[j].head<3>());
+        block.topRows<3>() = left_jacobian(point.y.bodies[i].head<3>()).transpose() * block.topRows<3>().eval();
+        block.leftCols<3>() = block.leftCols<3>().eval() * left_jacobian(point.y.bodies[j].head<3>());
+    }
+    for (int k = 0; k < static_cast<int>(pattern.mixed_pairs.size()); ++k) {
+        Mat63& block = system->mixed_pair(k);
+        const Vec3 theta = point.y.bodies[pattern.mixed_pairs[k].first].head<3>();
+        block.topRows<3>() = left_jacobian(theta).transpose() * block.topRows<3>().eval();
     }
 }
 

@@ -3,17 +3,18 @@
 #include <vector>
 
 #include "contact/block_system.hpp"
-#include "contact/contact.hpp"
+#include "contact/contact_derivatives.hpp"
+#include "dynamics/cloth_elasticity.hpp"
 
-/// An impact zone: bodies that may touch during a step, solved together.
+/// An impact zone: bodies and cloths that may touch during a step, solved together.
 ///
 /// Each body has six coordinates y = (theta, u) around its pose (R0, t0) at the start of the step: R = Exp(theta) R0,
 /// t = t0 + u. Positions are kept relative to the zone's origin, so that rounding does not grow with the distance
-/// from the world's. The step is the minimiser of [Qiao et al. 2020, Eq. 6, with contact as an energy]
-///     E(y) = ½ (y - ŷ)ᵀ M (y - ŷ) + Σ contact energies,   M = diag(R0 I_b R0ᵀ, m 1).
+/// from the world's. A cloth node has the coordinates y = u around its position at the start. The step is the minimiser of
+/// [Qiao et al. 2020, Eqs. 2 and 6 together, with contact as an energy]
+///     E(y) = ½ (y - ŷ)ᵀ M (y - ŷ) + dt² Ψ(y) + Σ contact energies,   M = diag(R0 I_b R0ᵀ, m 1), nodes m 1,
+/// with Ψ the elastic potential of the cloths (dynamics/cloth_elasticity.hpp).
 namespace diffsim {
-
-using Coordinates = std::vector<Vec6>;  ///< one (theta, u) per body of a zone
 
 struct ZoneBody {
     int id = 0;                   ///< index into Model::bodies
@@ -23,6 +24,21 @@ struct ZoneBody {
     double mass = kInfinity;     ///< infinite for bodies that do not yield
     Vec6 target = Vec6::Zero();  ///< ŷ: where a dynamic body goes when nothing touches it, a kinematic one is driven
     Vec6 warm = Vec6::Zero();    ///< last step's motion: dt (w0, v0)
+};
+
+struct ZoneNode {
+    Vec3 start = Vec3::Zero();  ///< at the start of the step, zone frame
+    double mass = 0.0;
+    bool pinned = false;         ///< moves to its target whatever happens
+    Vec3 target = Vec3::Zero();  ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
+    Vec3 warm = Vec3::Zero();    ///< last step's motion: dt v0
+};
+
+/// A cloth; all its nodes are in the zone.
+struct ZoneCloth {
+    int id = 0;          ///< index into Model::cloths
+    int first_node = 0;  ///< index into Zone::nodes
+    ElasticStart start;  ///< strains that damping is measured from
 };
 
 /// A body that other bodies cannot move, in the world frame.
@@ -40,8 +56,9 @@ struct PassiveBodies {
 
 struct ZoneContact {
     Contact contact;
-    int a, b;  ///< indices into Zone::bodies; b is kGround with the ground
-    int pair;  ///< block of the Hessian, or -1 when one of the two does not yield
+    int a, b;                        ///< indices into Zone::bodies, kNobody for cloth; b is kGround with the ground
+    int cloth_a = -1, cloth_b = -1;  ///< indices into Zone::cloths, -1 for others
+    int pair;                        ///< block of the Hessian where two bodies yield, or -1
     ContactRange range;
     ContactStiffness stiffness;
     double shift = 0.0;  ///< of range.rest, so that a hard contact's force acts at its rest distance [m]
@@ -54,14 +71,26 @@ struct Zone {
     bool hard = false;           ///< contacts do not give way: Eq. 6 as written
     Vec3 origin = Vec3::Zero();  ///< of the zone frame, world
     double ground_height = 0.0;  ///< zone frame
+    double dt = 0.0;             ///< [s]
     std::vector<ZoneBody> bodies;
     int dynamic_count = 0;
+    std::vector<ZoneNode> nodes;
+    std::vector<ZoneCloth> cloths;
+    const std::vector<ClothParameters>* cloth_parameters = nullptr;  ///< of all cloths of the model
+    bool elastic = true;        ///< false: cloth is loose nodes, as in the contact pass of split coupling
+    bool contacts_off = false;  ///< as in its elastic pass
     std::vector<ZoneContact> contacts;
-    std::vector<std::pair<int, int>> pairs;  ///< of dynamic bodies with contacts
+    IndexPairs pairs;  ///< of dynamic bodies with contacts
 
     const CollisionMesh& mesh(int body) const { return model->bodies[bodies[body].id].mesh; }
     int body_count() const { return static_cast<int>(bodies.size()); }
+    int node_count() const { return static_cast<int>(nodes.size()); }
+    const Cloth& cloth(int index) const { return model->cloths[cloths[index].id]; }
+    bool yields(int body) const { return body >= 0 && body < dynamic_count; }
 };
+
+/// Remove everything that a zone consists of.
+void clear(Zone& zone);
 
 /// Compliance 0 asks for hard contacts.
 inline void set_compliance(Zone& zone, double compliance) {
@@ -85,13 +114,27 @@ struct ActiveContact {
 struct ZonePoint {
     Coordinates y;
     std::vector<Pose> poses;
+    std::vector<Vec3> nodes;        ///< positions, zone frame
     std::vector<double> distances;  ///< one per contact
     std::vector<ActiveContact> active;
     double energy = 0.0;          ///< infinite at or below a pole
     double contact_energy = 0.0;  ///< the contacts' part
+    double elastic_energy = 0.0;  ///< the cloths' part, dt² Ψ
 };
 
 void evaluate(const Zone& zone, ZonePoint& point);
+
+/// Where bodies and nodes are at these coordinates.
+void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std::vector<Vec3>& nodes);
+
+/// The surfaces of a contact's two objects; the second is empty with the ground.
+Surface surface_a(
+    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
+Surface surface_b(
+    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
+
+/// The nodes of the zone that a contact's feature of a cloth has; -1 fills the rest.
+std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, bool of_a);
 
 /// How the second derivative is taken.
 enum class Curvature {
@@ -102,15 +145,28 @@ enum class Curvature {
 };
 
 struct ZoneDerivatives {
-    Coordinates gradient;
+    Coordinates gradient;      ///< zero at pinned nodes
     std::vector<Vec3> torque;  ///< world-frame gradient with respect to turns, contacts only
     double largest_force;      ///< of a single contact on a single body, in units of |L⁻¹ g|, M = L Lᵀ
-    double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|
+    double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|; of a node with the cloth's own
 };
 
-/// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's pattern.
+/// The pattern of a zone's Hessian without the contacts of cloth.
+BlockPattern base_pattern(const Zone& zone);
+
+/// Extend the system's pattern by what contacts of cloth couple, if need be.
+void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSystem& system);
+
+/// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's base pattern, and is extended
+/// by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix.
 void differentiate(
     const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system);
+
+/// Add a block to a system's rows of node i and columns of node j, once per pair. Pinned nodes have none.
+void add_node_block(const Zone& zone, int i, int j, const Mat3& block, BlockSystem& system);
+
+/// Add the elastic Hessian of the zone's cloths to a system, times dt². Pinned nodes are left out.
+void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessian kind, BlockSystem& system);
 
 /// d(twist)/dy of a body at theta: turns by the left Jacobian, shifts unchanged.
 Mat6 chart_jacobian(const Vec6& y);

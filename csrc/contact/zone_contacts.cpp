@@ -22,7 +22,54 @@ double sagitta(const Vec6& change, double radius) {
 SweptMesh swept_mesh(const Zone& zone, int body, const Coordinates& begin, const Coordinates& end, double slack) {
     const ZoneBody& b = zone.bodies[body];
     return {
-        &zone.mesh(body), {pose_at(b, begin[body]), pose_at(b, end[body])}, zone.model->bodies[b.id].margin + slack};
+        &zone.mesh(body),
+        {pose_at(b, begin.bodies[body]), pose_at(b, end.bodies[body])},
+        zone.model->bodies[b.id].margin + slack};
+}
+
+/// A cloth between two places, in the zone's frame.
+struct SweptCloth {
+    std::vector<Vec3> begin, end;
+    BoxTree tree;
+
+    /// Valid as long as this object stays where it is.
+    SweptMesh mesh(const Cloth& cloth, double reach) const {
+        return {&cloth.surface, {}, reach, begin.data(), end.data(), tree.empty() ? nullptr : &tree};
+    }
+};
+
+/// Mean motion of a cloth's nodes.
+Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end) {
+    Vec3 sum = Vec3::Zero();
+    for (int i = cloth.first_node; i < cloth.first_node + count; ++i) sum += end.nodes[i] - begin.nodes[i];
+    return sum / count;
+}
+
+SweptCloth sweep_cloth(
+    const Zone& zone, int index, const Coordinates& begin, const Coordinates& end, const Vec3& shift, double reach) {
+    const Cloth& cloth = zone.cloth(index);
+    const int first = zone.cloths[index].first_node;
+    SweptCloth swept;
+    for (int i = first; i < first + cloth.node_count(); ++i) {
+        swept.begin.push_back(zone.nodes[i].start + begin.nodes[i]);
+        swept.end.push_back(zone.nodes[i].start + end.nodes[i] - shift);
+    }
+    swept.tree = refitted_tree(swept.mesh(cloth, reach));
+    return swept;
+}
+
+/// Sum of the masses of a feature's nodes.
+double feature_mass(const Zone& zone, const ZoneContact& contact, bool of_a) {
+    double mass = 0.0;
+    for (int node : feature_nodes(zone, contact, of_a))
+        if (node >= 0) mass += zone.nodes[node].mass;
+    return mass;
+}
+
+/// Features of one cloth may be nearer at rest than its thickness: there they keep half of that.
+double self_margins(const Cloth& cloth, const Contact& contact, double margins) {
+    const Surface rest{&cloth.surface, nullptr, cloth.rest.data()};
+    return std::min(margins, 0.5 * contact_geometry(contact, rest, rest, 0.0).distance);
 }
 
 /// Let bodies that do not yield join the zone where its moving bodies come near them.
@@ -47,79 +94,182 @@ void join_passive(
         joined.start = {body.start.R, body.start.t - zone.origin};
         joined.target = body.target;
         zone.bodies.push_back(joined);
-        begin.push_back(Vec6::Zero());
-        end.push_back(body.target);
+        begin.bodies.push_back(Vec6::Zero());
+        end.bodies.push_back(body.target);
     }
 }
 
 }  // namespace
 
-void add_contact(Zone& zone, const Contact& contact, int a, int b) {
-    const double mass_b = b == kGround ? kInfinity : zone.bodies[b].mass;
+void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
     ZoneContact entry;
     entry.contact = contact;
-    entry.a = a;
-    entry.b = b;
+    entry.a = a.body;
+    entry.b = b.body;
+    entry.cloth_a = a.cloth;
+    entry.cloth_b = b.cloth;
     entry.pair = -1;
-    const double margins = zone.model->margin(contact.object_a) + zone.model->margin(contact.object_b);
+    double margins = zone.model->margin(contact.object_a) + zone.model->margin(contact.object_b);
+    if (contact.object_a == contact.object_b) margins = self_margins(zone.cloth(a.cloth), contact, margins);
     entry.range = contact_range(margins, zone.model->thickness);
-    entry.stiffness = contact_stiffness(zone.bodies[a].mass, mass_b, zone.compliance);
+    const double mass_a = a.cloth >= 0 ? feature_mass(zone, entry, true) : zone.bodies[a.body].mass;
+    const double mass_b = b.cloth >= 0        ? feature_mass(zone, entry, false)
+                          : b.body == kGround ? kInfinity
+                                              : zone.bodies[b.body].mass;
+    entry.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
     zone.contacts.push_back(entry);
 }
 
-ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end) {
-    ContactCoverage coverage;
-    zone.contacts.clear();
-    zone.pairs.clear();
-    std::vector<SweptMesh> meshes;
-    std::vector<Box> boxes;
-    const auto add_body = [&](int i) {
-        const Vec6 change = end[i] - begin[i];
-        const double radius = zone.mesh(i).radius;
-        const bool yields = i < zone.dynamic_count;
-        const double slack = yields ? 0.5 * zone.model->thickness + 0.25 * motion_bound(change, radius) : 0.0;
-        if (yields) coverage.slack.push_back(slack);
-        meshes.push_back(swept_mesh(zone, i, begin, end, slack + sagitta(change, radius)));
-        boxes.push_back(swept_box(meshes.back()));
-    };
-    for (int i = 0; i < zone.dynamic_count; ++i) add_body(i);
-    join_passive(zone, passive, boxes, begin, end);
-    for (int i = zone.dynamic_count; i < zone.body_count(); ++i) add_body(i);
+namespace {
 
-    if (zone.model->ground.present) {
+/// Collects the contacts of a zone; its steps as members.
+class ContactLister {
+public:
+    ContactLister(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end)
+        : m_zone(zone), m_passive(passive), m_begin(begin), m_end(end) {}
+
+    ContactCoverage run() {
+        m_zone.contacts.clear();
+        m_zone.pairs.clear();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) add_body(i);
+        if (m_zone.contacts_off) {
+            m_coverage.cloth_slack.assign(m_zone.cloths.size(), kInfinity);
+            m_coverage.begin = m_begin;
+            m_coverage.end = m_end;
+            return std::move(m_coverage);
+        }
+        const std::size_t cloth_count = m_zone.cloths.size();
+        m_cloths.reserve(cloth_count);  // meshes point into it
+        std::vector<SweptMesh> cloth_meshes;
+        for (int c = 0; c < static_cast<int>(cloth_count); ++c) cloth_meshes.push_back(add_cloth(c));
+        std::vector<Box> yielding = m_boxes;
+        for (const SweptMesh& mesh : cloth_meshes) yielding.push_back(swept_box(mesh));
+        join_passive(m_zone, m_passive, yielding, m_begin, m_end);
+        for (int i = m_zone.dynamic_count; i < m_zone.body_count(); ++i) add_body(i);
+        for (const SweptMesh& mesh : cloth_meshes) {
+            m_meshes.push_back(mesh);
+            m_boxes.push_back(swept_box(mesh));
+        }
+        if (m_zone.model->ground.present) list_ground();
+        if (m_meshes.size() > 1) list_pairs();
+        for (int c = 0; c < static_cast<int>(cloth_count); ++c) list_self(c);
+        m_coverage.begin = m_begin;
+        m_coverage.end = m_end;
+        return std::move(m_coverage);
+    }
+
+private:
+    /// Objects by their place in m_meshes: the bodies, then the cloths.
+    ZoneObject object(int i) const {
+        return i < m_zone.body_count() ? ZoneObject{i, -1} : ZoneObject{kNobody, i - m_zone.body_count()};
+    }
+    int id(int i) const {
+        return i < m_zone.body_count() ? m_zone.bodies[i].id
+                                       : m_zone.model->body_count() + m_zone.cloths[i - m_zone.body_count()].id;
+    }
+    bool yields(int i) const { return i < m_zone.dynamic_count || i >= m_zone.body_count(); }
+
+    void add_body(int i) {
+        const Vec6 change = m_end.bodies[i] - m_begin.bodies[i];
+        const double radius = m_zone.mesh(i).radius;
+        const bool yields = i < m_zone.dynamic_count;
+        const double slack = yields ? 0.5 * m_zone.model->thickness + 0.25 * motion_bound(change, radius) : 0.0;
+        if (yields) m_coverage.slack.push_back(slack);
+        m_meshes.push_back(swept_mesh(m_zone, i, m_begin, m_end, slack + sagitta(change, radius)));
+        m_boxes.push_back(swept_box(m_meshes.back()));
+    }
+
+    SweptMesh add_cloth(int c) {
+        const ZoneCloth& cloth = m_zone.cloths[c];
+        const Cloth& model = m_zone.cloth(c);
+        const Vec3 mean = mean_motion(cloth, model.node_count(), m_begin, m_end);
+        double uneven_sq = 0.0;
+        for (int i = cloth.first_node; i < cloth.first_node + model.node_count(); ++i)
+            uneven_sq = std::max(uneven_sq, (m_end.nodes[i] - m_begin.nodes[i] - mean).squaredNorm());
+        const double slack = 0.5 * m_zone.model->thickness + 0.25 * std::sqrt(uneven_sq);
+        m_coverage.cloth_slack.push_back(slack);
+        m_cloths.push_back(sweep_cloth(m_zone, c, m_begin, m_end, Vec3::Zero(), model.margin + slack));
+        return m_cloths.back().mesh(model, model.margin + slack);
+    }
+
+    void list_ground() {
         std::vector<int> vertices;
-        for (int i = 0; i < zone.dynamic_count; ++i) {
+        for (int i = 0; i < static_cast<int>(m_meshes.size()); ++i) {
+            if (!yields(i)) continue;
             vertices.clear();
-            collect_vertices_below(meshes[i], zone.ground_height + zone.model->ground.margin, vertices);
+            collect_vertices_below(m_meshes[i], m_zone.ground_height + m_zone.model->ground.margin, vertices);
             for (int v : vertices)
-                add_contact(zone, {zone.bodies[i].id, kGround, ContactType::vertex_patch, v, -1}, i, kGround);
+                add_contact(m_zone, {id(i), kGround, ContactType::vertex_patch, v, -1}, object(i), {kGround, -1});
         }
     }
-    if (zone.body_count() > 1) {
-        std::vector<FeaturePair> features;
-        for (const auto& [i, j] : overlapping_pairs(boxes)) {
-            if (i >= zone.dynamic_count) continue;
-            features.clear();
-            collect_feature_pairs(meshes[i], meshes[j], features);
-            if (features.empty()) continue;
-            const std::size_t first = zone.contacts.size();
-            for (const FeaturePair& f : features)
-                add_contact(zone, {zone.bodies[i].id, zone.bodies[j].id, f.type, f.feature_a, f.feature_b}, i, j);
-            if (j >= zone.dynamic_count) continue;
-            for (std::size_t k = first; k < zone.contacts.size(); ++k)
-                zone.contacts[k].pair = static_cast<int>(zone.pairs.size());
-            zone.pairs.emplace_back(i, j);
+
+    void list_pairs() {
+        for (const auto& [i, j] : overlapping_pairs(m_boxes)) {
+            if (!yields(i) && !yields(j)) continue;
+            m_features.clear();
+            collect_feature_pairs(m_meshes[i], m_meshes[j], m_features);
+            if (m_features.empty()) continue;
+            const std::size_t first = m_zone.contacts.size();
+            for (const FeaturePair& f : m_features)
+                add_contact(m_zone, {id(i), id(j), f.type, f.feature_a, f.feature_b}, object(i), object(j));
+            if (j >= m_zone.dynamic_count) continue;
+            for (std::size_t k = first; k < m_zone.contacts.size(); ++k)
+                m_zone.contacts[k].pair = static_cast<int>(m_zone.pairs.size());
+            m_zone.pairs.emplace_back(i, j);
         }
     }
-    coverage.begin = begin;
-    coverage.end = end;
-    return coverage;
+
+    /// A cloth with itself: what it does as a whole brings none of its features together.
+    void list_self(int c) {
+        const Cloth& model = m_zone.cloth(c);
+        const Vec3 mean = mean_motion(m_zone.cloths[c], model.node_count(), m_begin, m_end);
+        const double reach = model.margin + m_coverage.cloth_slack[c];
+        const SweptCloth swept = sweep_cloth(m_zone, c, m_begin, m_end, mean, reach);
+        m_features.clear();
+        collect_self_pairs(swept.mesh(model, reach), m_features);
+        const int object_id = m_zone.model->body_count() + m_zone.cloths[c].id;
+        for (const FeaturePair& f : m_features)
+            add_contact(m_zone, {object_id, object_id, f.type, f.feature_a, f.feature_b}, {kNobody, c}, {kNobody, c});
+    }
+
+    Zone& m_zone;
+    const PassiveBodies& m_passive;
+    Coordinates &m_begin, &m_end;
+    ContactCoverage m_coverage;
+    std::vector<SweptMesh> m_meshes;
+    std::vector<Box> m_boxes;
+    std::vector<SweptCloth> m_cloths;
+    std::vector<FeaturePair> m_features;
+};
+
+/// Whether a cloth's nodes are near the points that they pass at one and the same time of the segment.
+bool is_cloth_covered(const Zone& zone, const ContactCoverage& coverage, int index, const Coordinates& y) {
+    const int first = zone.cloths[index].first_node, end = first + zone.cloth(index).node_count();
+    double along = 0.0, length_sq = 0.0;
+    for (int i = first; i < end; ++i) {
+        const Vec3 segment = coverage.end.nodes[i] - coverage.begin.nodes[i];
+        along += segment.dot(y.nodes[i] - coverage.begin.nodes[i]);
+        length_sq += segment.squaredNorm();
+    }
+    const double s = length_sq > 0.0 ? std::clamp(along / length_sq, 0.0, 1.0) : 0.0;
+    const double slack_sq = coverage.cloth_slack[index] * coverage.cloth_slack[index];
+    for (int i = first; i < end; ++i) {
+        const Vec3 segment = coverage.end.nodes[i] - coverage.begin.nodes[i];
+        if ((y.nodes[i] - coverage.begin.nodes[i] - s * segment).squaredNorm() > slack_sq) return false;
+    }
+    return true;
+}
+
+}  // namespace
+
+ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end) {
+    return ContactLister(zone, passive, begin, end).run();
 }
 
 bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordinates& y) {
     for (int i = 0; i < zone.dynamic_count; ++i) {
-        const Vec6 segment = coverage.end[i] - coverage.begin[i];
-        const Vec6 offset = y[i] - coverage.begin[i];
+        const Vec6 segment = coverage.end.bodies[i] - coverage.begin.bodies[i];
+        const Vec6 offset = y.bodies[i] - coverage.begin.bodies[i];
         const double radius = zone.mesh(i).radius;
         // Nearest point of the segment, with turns weighed by the radius.
         Vec6 weighed = segment;
@@ -129,34 +279,72 @@ bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordin
         const Vec6 deviation = offset - s * segment;
         if (motion_bound(deviation, radius) > coverage.slack[i]) return false;
     }
+    for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c)
+        if (!is_cloth_covered(zone, coverage, c, y)) return false;
     return true;
 }
+
+namespace {
+
+/// Bounds on how far vertices of objects move, common motion of a cloth with itself left out.
+class MotionBounds {
+public:
+    MotionBounds(const Zone& zone, const ZonePoint& point, const Coordinates& y_end) : m_zone(zone) {
+        for (int i = 0; i < zone.body_count(); ++i)
+            m_bodies.push_back(motion_bound(y_end.bodies[i] - point.y.bodies[i], zone.mesh(i).radius));
+        for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
+            const int first = zone.cloths[c].first_node, count = zone.cloth(c).node_count();
+            const Vec3 mean = mean_motion(zone.cloths[c], count, point.y, y_end);
+            for (int i = first; i < first + count; ++i) {
+                const Vec3 change = y_end.nodes[i] - point.y.nodes[i];
+                m_nodes.push_back(change.norm());
+                m_uneven.push_back((change - mean).norm());
+            }
+        }
+    }
+
+    double approach(const ZoneContact& contact) const {
+        const bool self = contact.contact.object_a == contact.contact.object_b;
+        return of(contact, true, self) + (contact.contact.with_ground() ? 0.0 : of(contact, false, self));
+    }
+
+private:
+    double of(const ZoneContact& contact, bool of_a, bool self) const {
+        if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) return m_bodies[of_a ? contact.a : contact.b];
+        double bound = 0.0;
+        for (int node : feature_nodes(m_zone, contact, of_a))
+            if (node >= 0) bound = std::max(bound, (self ? m_uneven : m_nodes)[node]);
+        return bound;
+    }
+
+    const Zone& m_zone;
+    std::vector<double> m_bodies, m_nodes, m_uneven;
+};
+
+}  // namespace
 
 double allowed_step(const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts) {
     if (impacts != nullptr) impacts->clear();
     if (zone.contacts.empty()) return 1.0;
-    const int count = zone.body_count();
-    std::vector<double> motion(static_cast<std::size_t>(count));
-    std::vector<Sweep> sweeps(static_cast<std::size_t>(count));
-    for (int i = 0; i < count; ++i) {
-        motion[i] = motion_bound(y_end[i] - point.y[i], zone.mesh(i).radius);
-        sweeps[i] = {point.poses[i], pose_at(zone.bodies[i], y_end[i])};
-    }
+    const MotionBounds motion(zone, point, y_end);
+    std::vector<Pose> poses_end;
+    std::vector<Vec3> nodes_end;
+    place(zone, y_end, poses_end, nodes_end);
     double step = 1.0;
-    static const Sweep kNoSweep;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
-        const bool ground = contact.contact.with_ground();
         // A pair that is already nearer than the floor may use up most of what is left above the pole.
         const double room = point.distances[k] - contact.range.pole;
         CcdOptions ccd;
         const double keep = std::min(contact.range.floor - contact.range.pole, 0.1 * room);
         ccd.min_distance = contact.range.pole + keep;
         ccd.tolerance = 0.2 * keep;
-        if (motion[contact.a] + (ground ? 0.0 : motion[contact.b]) < room - 1.2 * keep) continue;
+        if (motion.approach(contact) < room - 1.2 * keep) continue;
         const double toi = contact_toi(
-            *zone.model, contact.contact, sweeps[contact.a], ground ? kNoSweep : sweeps[contact.b], zone.ground_height,
-            ccd);
+            contact.contact,
+            {surface_a(zone, contact, point.poses, point.nodes), surface_a(zone, contact, poses_end, nodes_end)},
+            {surface_b(zone, contact, point.poses, point.nodes), surface_b(zone, contact, poses_end, nodes_end)},
+            zone.ground_height, ccd);
         if (toi == kNoImpact) continue;
         step = std::min(step, toi);
         if (impacts != nullptr) impacts->push_back({static_cast<int>(k), toi});

@@ -8,14 +8,21 @@ namespace diffsim {
 /// from `begin` to `end`.
 struct ContactCoverage {
     Coordinates begin, end;
-    std::vector<double> slack;  ///< one per dynamic body [m]
+    std::vector<double> slack;        ///< one per dynamic body [m]
+    std::vector<double> cloth_slack;  ///< one per cloth, for each of its nodes [m]
 };
 
-/// Append a contact between bodies a and b of the zone (b may be kGround) with its range and stiffness; its block of the
-/// Hessian is left open.
-void add_contact(Zone& zone, const Contact& contact, int a, int b);
+/// An object of a zone: a body, a cloth, or {kGround}.
+struct ZoneObject {
+    int body = kNobody;
+    int cloth = -1;
+};
 
-/// List the zone's contacts for motions along the segment from `begin` to `end` and somewhat around it. Bodies of
+/// Append a contact between two objects of the zone with its range and stiffness; its block of the Hessian is left open.
+void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b);
+
+/// List the zone's contacts, of cloths with themselves too, for motions along the segment from `begin` to `end` and
+/// somewhat around it. Bodies of
 /// `passive` that come near join the zone. `begin` and `end` are extended where bodies join.
 ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end);
 

@@ -45,9 +45,9 @@ private:
     void start() {
         const std::size_t count = static_cast<std::size_t>(m_zone.dynamic_count);
         m_zone.bodies.resize(count);  // those that do not yield join anew
-        m_w.point.y.assign(count, Vec6::Zero());
-        m_w.y_end.resize(count);
-        for (std::size_t i = 0; i < count; ++i) m_w.y_end[i] = m_zone.bodies[i].target;
+        m_w.point.y.assign_zero(count, m_zone.nodes.size());
+        m_w.y_end.resize(count, m_zone.nodes.size());
+        set_to_targets(m_w.y_end);
         list_contacts(m_w.y_end);
         evaluate(m_zone, m_w.point);
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
@@ -62,8 +62,13 @@ private:
             rescue_contacts(m_zone);
             evaluate(m_zone, m_w.point);
         }
-        m_visited.assign(count, Box());
+        m_visited.assign(count + m_zone.cloths.size(), Box());
         mark_visited();
+    }
+
+    void set_to_targets(Coordinates& y_end) const {
+        for (std::size_t i = 0; i < y_end.bodies.size(); ++i) y_end.bodies[i] = m_zone.bodies[i].target;
+        for (std::size_t i = 0; i < y_end.nodes.size(); ++i) y_end.nodes[i] = m_zone.nodes[i].target;
     }
 
     /// List contacts for the way from the current point to y_end.
@@ -76,7 +81,8 @@ private:
             const ZoneBody& body = m_zone.bodies[i];
             m_position = std::max(m_position, body.start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
         }
-        m_w.system.set_pattern(m_zone.dynamic_count, m_zone.pairs);
+        for (const ZoneNode& node : m_zone.nodes) m_position = std::max(m_position, node.start.cwiseAbs().maxCoeff());
+        m_w.system.set_pattern(base_pattern(m_zone));
     }
 
     /// Make the list complete for a step to y_end; true if it had to be made anew.
@@ -90,17 +96,23 @@ private:
     void mark_visited() {
         for (int i = 0; i < m_zone.dynamic_count; ++i)
             m_visited[i].include(transformed(m_zone.mesh(i).tree.nodes[0].box, m_w.point.poses[i]));
+        for (int c = 0; c < static_cast<int>(m_zone.cloths.size()); ++c) {
+            Box& box = m_visited[static_cast<std::size_t>(m_zone.dynamic_count + c)];
+            const int first = m_zone.cloths[c].first_node;
+            for (int i = first; i < first + m_zone.cloth(c).node_count(); ++i) box.include(m_w.point.nodes[i]);
+        }
     }
 
     /// Nothing touches on the way to the target and there: done without an iteration.
     bool try_free_motion() {
         if (!m_w.point.active.empty()) return false;
-        m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
-        for (int i = 0; i < m_zone.body_count(); ++i) m_w.y_end[i] = m_zone.bodies[i].target;
-        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
+        m_w.y_end.bodies.resize(m_zone.bodies.size());
+        set_to_targets(m_w.y_end);
+        if (m_zone.dynamic_count > 0 && allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
             m_gates = find_impact_gates(m_zone, m_w.point, m_w.y_end);
             return false;
         }
+        if (!m_zone.cloths.empty() && m_zone.elastic) return false;
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial);
         if (!m_w.trial.active.empty()) return false;
@@ -111,7 +123,9 @@ private:
     /// Last step's motion already respected last step's contacts: it is the natural first iterate.
     void go_to_warm_start() {
         m_w.y_end = y();
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end[i] = m_zone.bodies[i].warm;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].warm;
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
         if (largest_move() < kEpsilon * m_position) return;
         ensure_covered(m_w.y_end);
         const double step = clear_step(m_w.y_end);
@@ -143,13 +157,18 @@ private:
     }
 
     void set_trial(const Coordinates& y_end, double step) {
-        m_w.trial.y.resize(y_end.size());
-        for (std::size_t i = 0; i < y_end.size(); ++i) m_w.trial.y[i] = y()[i] + step * (y_end[i] - y()[i]);
+        m_w.trial.y.resize(y_end.bodies.size(), y_end.nodes.size());
+        for (std::size_t i = 0; i < y_end.bodies.size(); ++i)
+            m_w.trial.y.bodies[i] = y().bodies[i] + step * (y_end.bodies[i] - y().bodies[i]);
+        for (std::size_t i = 0; i < y_end.nodes.size(); ++i)
+            m_w.trial.y.nodes[i] = y().nodes[i] + step * (y_end.nodes[i] - y().nodes[i]);
     }
 
     bool drives_done() const {
         for (int i = m_zone.dynamic_count; i < m_zone.body_count(); ++i)
-            if (m_w.point.y[i] != m_zone.bodies[i].target) return false;
+            if (m_w.point.y.bodies[i] != m_zone.bodies[i].target) return false;
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (m_zone.nodes[i].pinned && m_w.point.y.nodes[i] != m_zone.nodes[i].target) return false;
         return true;
     }
 
@@ -164,9 +183,16 @@ private:
         double residual = 0.0, reference = m_w.derivatives.largest_force;
         for (int i = 0; i < m_zone.dynamic_count; ++i) {
             const ZoneBody& body = m_zone.bodies[i];
-            const Vec6& g = m_w.derivatives.gradient[i];
+            const Vec6& g = m_w.derivatives.gradient.bodies[i];
             residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
             reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
+        }
+        for (int i = 0; i < m_zone.node_count(); ++i) {
+            const ZoneNode& node = m_zone.nodes[i];
+            if (node.pinned) continue;
+            const double root_mass = std::sqrt(node.mass);
+            residual = std::max(residual, m_w.derivatives.gradient.nodes[i].norm() / root_mass);
+            reference = std::max(reference, (node.warm - node.target).norm() * root_mass);
         }
         // Nothing pushes here and nothing did before: only the exact answer will do, or a step lost in rounding.
         if (!(reference > 0.0)) return {residual > 0.0 ? 1.0 : 0.0, 0.0};
@@ -189,26 +215,34 @@ private:
             differentiate_here(Curvature::projected);
             if (!m_w.system.factorize()) return false;
         }
-        m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count));
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step[i] = -m_w.derivatives.gradient[i];
+        m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step.bodies[i] = -m_w.derivatives.gradient.bodies[i];
+        for (int i = 0; i < m_zone.node_count(); ++i) m_w.step.nodes[i] = -m_w.derivatives.gradient.nodes[i];
         m_w.system.solve_in_place(m_w.step);
-        for (const Vec6& s : m_w.step)
+        for (const Vec6& s : m_w.step.bodies)
+            if (!s.allFinite()) return false;
+        for (const Vec3& s : m_w.step.nodes)
             if (!s.allFinite()) return false;
         return true;
     }
 
     double slope(const Coordinates& gradient) const {
         double sum = 0.0;
-        for (int i = 0; i < m_zone.dynamic_count; ++i) sum += gradient[i].dot(m_w.y_end[i] - m_w.point.y[i]);
+        for (int i = 0; i < m_zone.dynamic_count; ++i)
+            sum += gradient.bodies[i].dot(m_w.y_end.bodies[i] - m_w.point.y.bodies[i]);
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            sum += gradient.nodes[i].dot(m_w.y_end.nodes[i] - m_w.point.y.nodes[i]);
         return sum;
     }
 
     double largest_move() const {
         double largest = 0.0;
         for (int i = 0; i < m_zone.dynamic_count; ++i) {
-            const Vec6 move = m_w.y_end[i] - m_w.point.y[i];
+            const Vec6 move = m_w.y_end.bodies[i] - m_w.point.y.bodies[i];
             largest = std::max({largest, move.tail<3>().norm(), move.head<3>().norm() * m_zone.mesh(i).radius});
         }
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            largest = std::max(largest, (m_w.y_end.nodes[i] - m_w.point.y.nodes[i]).norm());
         return largest;
     }
 
@@ -259,7 +293,9 @@ private:
             const Accuracy now = accuracy();
             m_result.residual = now.residual;
             m_w.y_end = y();
-            for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end[i] += m_w.step[i];
+            for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] += m_w.step.bodies[i];
+            for (int i = 0; i < m_zone.node_count(); ++i)
+                if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] += m_w.step.nodes[i];
             const double rounding_step = 16.0 * kEpsilon * m_position;
             if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
                 polish();
@@ -298,7 +334,7 @@ private:
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
     double past_impacts(double newton_limit, bool driven) {
         Coordinates target = y();
-        for (int i = 0; i < m_zone.body_count(); ++i) target[i] = m_zone.bodies[i].target;
+        set_to_targets(target);
         ensure_covered(target);
         ImpactDirection direction = impact_direction(m_zone, m_w.point, m_w.system);
         for (int k = 0; k < 8 && !is_covered(m_zone, m_coverage, direction.y_end); ++k) {
@@ -308,12 +344,13 @@ private:
         }
         const Coordinates newton_end = m_w.y_end;
         m_w.y_end = direction.y_end;
-        m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
+        m_w.y_end.bodies.resize(m_zone.bodies.size());
         const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
         if (good) return covered_step();
         m_w.y_end = newton_end;
-        m_w.y_end.resize(static_cast<std::size_t>(m_zone.body_count()));
-        for (std::size_t i = newton_end.size(); i < m_w.y_end.size(); ++i) m_w.y_end[i] = m_zone.bodies[i].target;
+        m_w.y_end.bodies.resize(m_zone.bodies.size());
+        for (std::size_t i = newton_end.bodies.size(); i < m_w.y_end.bodies.size(); ++i)
+            m_w.y_end.bodies[i] = m_zone.bodies[i].target;
         return covered_step();
     }
 

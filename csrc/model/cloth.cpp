@@ -97,6 +97,15 @@ Cloth build_cloth(std::vector<Vec3> rest, const std::vector<Triangle>& triangles
                 std::to_string(around.size()) + " triangles, at most two can meet");
         if (around.size() == 2) cloth.hinges.push_back(build_hinge(cloth, edge, around));
     }
+    const auto couple = [&](const auto& nodes) {
+        for (std::size_t i = 0; i < nodes.size(); ++i)
+            for (std::size_t j = i + 1; j < nodes.size(); ++j)
+                cloth.node_pairs.emplace_back(std::min(nodes[i], nodes[j]), std::max(nodes[i], nodes[j]));
+    };
+    for (const ClothTriangle& triangle : cloth.triangles) couple(triangle.nodes);
+    for (const ClothHinge& hinge : cloth.hinges) couple(hinge.nodes);
+    std::sort(cloth.node_pairs.begin(), cloth.node_pairs.end());
+    cloth.node_pairs.erase(std::unique(cloth.node_pairs.begin(), cloth.node_pairs.end()), cloth.node_pairs.end());
     cloth.surface = build_collision_mesh(cloth.rest, triangles, Faces::separate);
     return cloth;
 }

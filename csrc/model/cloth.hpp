@@ -32,7 +32,8 @@ struct Cloth {
     std::vector<double> node_area;         ///< a third of the area of the triangles around each node, at rest [m²]
     std::vector<ClothTriangle> triangles;  ///< as given
     std::vector<ClothHinge> hinges;        ///< in the order of their edges
-    CollisionMesh surface;                 ///< topology for collision: triangles unmerged, every edge
+    std::vector<std::pair<int, int>> node_pairs;  ///< i < j, sorted: nodes that some triangle or hinge couples
+    CollisionMesh surface;                        ///< topology for collision: triangles unmerged, every edge
 
     int node_count() const { return static_cast<int>(rest.size()); }
 };

@@ -150,25 +150,45 @@ inline ZoneBody zone_body(int id, const Pose& start, double mass, const Mat3& in
 
 /// The whole matrix of a block system.
 inline MatrixX dense(const BlockSystem& system) {
-    MatrixX matrix = MatrixX::Zero(6 * system.body_count(), 6 * system.body_count());
-    for (int i = 0; i < system.body_count(); ++i) matrix.block<6, 6>(6 * i, 6 * i) = system.diagonal(i);
-    for (std::size_t k = 0; k < system.pairs().size(); ++k) {
-        const auto [i, j] = system.pairs()[k];
-        matrix.block<6, 6>(6 * i, 6 * j) = system.off_diagonal(static_cast<int>(k));
-        matrix.block<6, 6>(6 * j, 6 * i) = system.off_diagonal(static_cast<int>(k)).transpose();
-    }
+    const BlockPattern& pattern = system.pattern();
+    const int bodies = pattern.body_count, first_node = 6 * bodies, size = first_node + 3 * pattern.node_count;
+    MatrixX matrix = MatrixX::Zero(size, size);
+    for (int i = 0; i < bodies; ++i) matrix.block<6, 6>(6 * i, 6 * i) = system.diagonal(i);
+    for (int i = 0; i < pattern.node_count; ++i)
+        matrix.block<3, 3>(first_node + 3 * i, first_node + 3 * i) = system.node_diagonal(i);
+    const auto add = [&](int row, int column, const MatrixX& block) {
+        matrix.block(row, column, block.rows(), block.cols()) = block;
+        matrix.block(column, row, block.cols(), block.rows()) = block.transpose();
+    };
+    for (std::size_t k = 0; k < pattern.body_pairs.size(); ++k)
+        add(6 * pattern.body_pairs[k].first, 6 * pattern.body_pairs[k].second,
+            system.off_diagonal(static_cast<int>(k)));
+    for (std::size_t k = 0; k < pattern.mixed_pairs.size(); ++k)
+        add(6 * pattern.mixed_pairs[k].first, first_node + 3 * pattern.mixed_pairs[k].second,
+            system.mixed_pair(static_cast<int>(k)));
+    for (std::size_t k = 0; k < pattern.node_pairs.size(); ++k)
+        add(first_node + 3 * pattern.node_pairs[k].first, first_node + 3 * pattern.node_pairs[k].second,
+            system.node_pair(static_cast<int>(k)));
     return matrix;
 }
 
 inline VectorX flatten(const Coordinates& y) {
-    VectorX x(6 * static_cast<Eigen::Index>(y.size()));
-    for (std::size_t i = 0; i < y.size(); ++i) x.segment<6>(6 * static_cast<Eigen::Index>(i)) = y[i];
+    const Eigen::Index bodies = static_cast<Eigen::Index>(y.bodies.size());
+    VectorX x(6 * bodies + 3 * static_cast<Eigen::Index>(y.nodes.size()));
+    for (std::size_t i = 0; i < y.bodies.size(); ++i) x.segment<6>(6 * static_cast<Eigen::Index>(i)) = y.bodies[i];
+    for (std::size_t i = 0; i < y.nodes.size(); ++i)
+        x.segment<3>(6 * bodies + 3 * static_cast<Eigen::Index>(i)) = y.nodes[i];
     return x;
 }
 
-inline Coordinates unflatten(const VectorX& x) {
-    Coordinates y(static_cast<std::size_t>(x.size() / 6));
-    for (std::size_t i = 0; i < y.size(); ++i) y[i] = x.segment<6>(6 * static_cast<Eigen::Index>(i));
+/// The first `body_count` times six numbers are bodies', the others nodes'. Default: there are bodies only.
+inline Coordinates unflatten(const VectorX& x, Eigen::Index body_count = -1) {
+    if (body_count < 0) body_count = x.size() / 6;
+    Coordinates y;
+    y.resize(static_cast<std::size_t>(body_count), static_cast<std::size_t>((x.size() - 6 * body_count) / 3));
+    for (std::size_t i = 0; i < y.bodies.size(); ++i) y.bodies[i] = x.segment<6>(6 * static_cast<Eigen::Index>(i));
+    for (std::size_t i = 0; i < y.nodes.size(); ++i)
+        y.nodes[i] = x.segment<3>(6 * body_count + 3 * static_cast<Eigen::Index>(i));
     return y;
 }
 

@@ -74,7 +74,7 @@ struct Scene {
     VectorX solution() const {
         ZonePoint point;
         const Zone solved = solve(point);
-        point.y.resize(static_cast<std::size_t>(solved.dynamic_count));
+        point.y.bodies.resize(static_cast<std::size_t>(solved.dynamic_count));
         return flatten(point.y);
     }
 };
@@ -121,7 +121,7 @@ void check_same_system(const Zone& zone, const ZonePoint& point) {
         const VectorX by_qr = multiplier(zone, point, upstream, AdjointMode::qr);
         BlockSystem system;
         ZoneDerivatives derivatives;
-        system.set_pattern(zone.dynamic_count, zone.pairs);
+        system.set_pattern(base_pattern(zone));
         differentiate(zone, point, Curvature::dropped, derivatives, &system);
         const VectorX direct = dense(system).ldlt().solve(flatten(upstream));
         CHECK(by_lu.norm() > 0.0);
@@ -153,7 +153,7 @@ TEST(dense_and_qr_solve_the_same_system_on_turned_coordinates) {
     const Scene scene = landing();
     const Zone zone = scene.solve(point);
     CHECK(point.active.size() >= 2);
-    CHECK(point.y[0].head<3>().norm() > 0.05);
+    CHECK(point.y.bodies[0].head<3>().norm() > 0.05);
     check_same_system(zone, point);
 }
 
@@ -184,7 +184,7 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
         for (std::size_t i = 0; i < count; ++i) {
             NOTE(i);
             const ZoneBody& body = scene.bodies[i];
-            const Vec6& z = adjoint.multiplier[i];
+            const Vec6& z = adjoint.multiplier.bodies[i];
             Vec6 by_target, by_start;
             by_target << body.inertia * z.head<3>(), body.mass * z.tail<3>();
             const auto targeted = [&](const VectorX& x) {
@@ -196,8 +196,8 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
             CHECK_NEAR(by_target, fixtures::numeric_gradient(targeted, VectorX::Zero(6), kStep), kDifferences);
 
             // The base pose moves, targets and inertia stay: a turn arrives at the end of the step turned by Exp(theta).
-            const Vec6& pose = adjoint.pose_gradient[i];
-            by_start << exp_rotation(point.y[i].head<3>()).transpose() * pose.head<3>(), pose.tail<3>();
+            const Vec6& pose = adjoint.place_gradient.bodies[i];
+            by_start << exp_rotation(point.y.bodies[i].head<3>()).transpose() * pose.head<3>(), pose.tail<3>();
             const auto started = [&](const VectorX& x) {
                 Scene changed = scene;
                 changed.bodies[i].start.R = exp_rotation(Vec3(x.head<3>())) * body.start.R;
@@ -209,7 +209,8 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
             CHECK_NEAR(by_start, numeric, 10.0 * kDifferences * (1.0 + by_start.norm()));
 
             // The mass, through the contacts' stiffness and through the inertial term.
-            const double by_mass = adjoint.mass_gradient[i] - z.tail<3>().dot((point.y[i] - body.target).tail<3>());
+            const double by_mass =
+                adjoint.mass_gradient[i] - z.tail<3>().dot((point.y.bodies[i] - body.target).tail<3>());
             const auto weighed = [&](const VectorX& x) {
                 Scene changed = scene;
                 changed.bodies[i].mass += x[0];
@@ -237,7 +238,7 @@ TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
         changed.plant_tree();
         return flatten(upstream).dot(changed.solution());
     };
-    const Vec6& analytic = adjoint.pose_gradient[1];
+    const Vec6& analytic = adjoint.place_gradient.bodies[1];
     CHECK(analytic.tail<3>().norm() > 1e-2);
     CHECK_NEAR(
         analytic, fixtures::numeric_gradient(moved, VectorX::Zero(6), kStep), 10.0 * kDifferences * analytic.norm());

@@ -24,9 +24,9 @@ Pairs random_pairs(check::Random& random, int count) {
 /// Σ over pairs of a random 12x12 Gram matrix, plus the identity.
 void fill(BlockSystem& system, check::Random& random) {
     system.set_zero();
-    for (int i = 0; i < system.body_count(); ++i) system.diagonal(i) = Mat6::Identity();
-    for (std::size_t k = 0; k < system.pairs().size(); ++k) {
-        const auto [i, j] = system.pairs()[k];
+    for (int i = 0; i < system.pattern().body_count; ++i) system.diagonal(i) = Mat6::Identity();
+    for (std::size_t k = 0; k < system.pattern().body_pairs.size(); ++k) {
+        const auto [i, j] = system.pattern().body_pairs[k];
         const MatrixX rows = random.matrix(12, 12), gram = rows * rows.transpose();
         system.diagonal(i) += gram.topLeftCorner<6, 6>();
         system.diagonal(j) += gram.bottomRightCorner<6, 6>();
@@ -53,7 +53,7 @@ TEST(block_system_agrees_with_a_dense_matrix) {
     for (const int count : {1, 2, 3, 8, 9, 40}) {
         NOTE(count);
         BlockSystem system;
-        system.set_pattern(count, random_pairs(random, count));
+        system.set_pattern({count, 0, random_pairs(random, count), {}, {}});
         fill(system, random);
         check_solution(system, random);
         fill(system, random);  // the same pattern, other numbers
@@ -66,11 +66,11 @@ TEST(block_system_can_change_its_pattern) {
     BlockSystem system;
     for (const int count : {40, 3, 12, 1, 12, 40}) {
         NOTE(count);
-        system.set_pattern(count, random_pairs(random, count));
+        system.set_pattern({count, 0, random_pairs(random, count), {}, {}});
         fill(system, random);
         check_solution(system, random);
     }
-    system.set_pattern(40, {{0, 39}});  // as many bodies, other pairs
+    system.set_pattern({40, 0, {{0, 39}}, {}, {}});  // as many bodies, other pairs
     fill(system, random);
     check_solution(system, random);
     BlockSystem moved = std::move(system);
@@ -81,13 +81,13 @@ TEST(block_system_without_pairs) {
     check::Random random(3);
     for (const int count : {1, 5, 20}) {
         BlockSystem system;
-        system.set_pattern(count, {});
+        system.set_pattern({count, 0, {}, {}, {}});
         fill(system, random);
         for (int i = 0; i < count; ++i) system.diagonal(i) *= 1.0 + i;
-        Coordinates x(static_cast<std::size_t>(count), Vec6::Ones());
+        Coordinates x = fixtures::unflatten(VectorX::Ones(6 * count));
         CHECK(system.factorize());
         system.solve_in_place(x);
-        for (int i = 0; i < count; ++i) CHECK_NEAR(x[i], Vec6::Constant(1.0 / (1.0 + i)), 1e-15);
+        for (int i = 0; i < count; ++i) CHECK_NEAR(x.bodies[i], Vec6::Constant(1.0 / (1.0 + i)), 1e-15);
     }
 }
 
@@ -96,7 +96,7 @@ TEST(block_system_refuses_what_is_not_positive_definite) {
     for (const int count : {1, 3, 8, 9, 40}) {
         NOTE(count);
         BlockSystem system;
-        system.set_pattern(count, random_pairs(random, count));
+        system.set_pattern({count, 0, random_pairs(random, count), {}, {}});
         fill(system, random);
         system.diagonal(count - 1)(5, 5) = -1.0;
         CHECK(!system.factorize());

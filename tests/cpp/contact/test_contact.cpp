@@ -1,4 +1,4 @@
-#include "contact/contact.hpp"
+#include "contact/contact_derivatives.hpp"
 
 #include <algorithm>
 #include <map>
@@ -45,8 +45,8 @@ struct Situation {
     }
     ContactGeometry geometry() const { return contact_geometry(model, contact, a, b, 0.0); }
     double energy() const { return contact_energy(geometry(), range, kStiffness); }
-    ContactDerivatives derivatives(bool with_curvature = true) const {
-        return contact_derivatives(geometry(), range, kStiffness, a.t, b.t, true, with_curvature);
+    ContactDerivatives<12> derivatives(bool with_curvature = true) const {
+        return contact_derivatives(geometry(), range, kStiffness, BodySide{a.t}, BodySide{b.t}, true, with_curvature);
     }
     /// Gradient in the chart of the poses from which x counts: a turn's is Jᵀ of that along the twist at x.
     VectorX gradient(const VectorX& x) const {
@@ -116,7 +116,7 @@ void make_parallel(Situation& s, check::Random& random, double angle, double gap
 }
 
 void check_derivatives(const Situation& s, double tolerance) {
-    const ContactDerivatives d = s.derivatives();
+    const ContactDerivatives<12> d = s.derivatives();
     const VectorX zero = VectorX::Zero(12);
     CHECK(d.gradient.norm() > 0.0);
     CHECK(d.hessian.norm() > 0.0);
@@ -196,7 +196,7 @@ TEST(energy_is_continuously_differentiable_where_the_type_changes) {
             }
             const Situation before = at(low), after = at(high);
             if (before.geometry().distance < 0.05) continue;  // a passage through the surface
-            const ContactDerivatives d0 = before.derivatives(), d1 = after.derivatives();
+            const ContactDerivatives<12> d0 = before.derivatives(), d1 = after.derivatives();
             CHECK(d0.gradient.norm() > 0.0);
             CHECK_NEAR(after.energy(), before.energy(), kJump * before.energy());
             const bool mollified = before.code().second || after.code().second;
@@ -214,7 +214,7 @@ TEST(curvature_can_be_left_out) {
     check::Random random(4);
     Situation s = random_situation(model, random, 0);
     s.press(0.3);
-    const ContactDerivatives full = s.derivatives(), dropped = s.derivatives(false);
+    const ContactDerivatives<12> full = s.derivatives(), dropped = s.derivatives(false);
     CHECK(dropped.gradient == full.gradient);
     CHECK_NEAR(dropped.hessian, full.stiffness * full.row * full.row.transpose(), 1e-12 * full.hessian.norm());
     CHECK((full.hessian - dropped.hessian).norm() > 1e-3 * full.hessian.norm());
@@ -275,8 +275,13 @@ TEST(contact_toi_stops_every_type_at_its_floor) {
         if (s.geometry().distance < 0.1) continue;
         Vec6 twist = 0.2 * random.vector(6);
         twist.tail<3>() -= 1.5 * s.geometry().distance * s.geometry().normal;
-        const Sweep sweep_a{s.a, s.moved(s.a, twist)}, sweep_b{s.b, s.b};
-        const double toi = contact_toi(model, s.contact, sweep_a, sweep_b, 0.0, options);
+        const Sweep sweep_a{s.a, s.moved(s.a, twist)};
+        const CollisionMesh &mesh_a = model.bodies[s.contact.object_a].mesh,
+                            &mesh_b = model.bodies[s.contact.object_b].mesh;
+        const Surface still{&mesh_b, &s.b, nullptr};
+        const double toi = contact_toi(
+            s.contact, {{&mesh_a, &sweep_a.begin, nullptr}, {&mesh_a, &sweep_a.end, nullptr}}, {still, still}, 0.0,
+            options);
         if (toi == kNoImpact) continue;
         CHECK(toi > 0.0);
         // Vertices go straight: the pose between is an affine map, which Pose can hold.
@@ -293,7 +298,9 @@ TEST(contact_toi_stops_every_type_at_its_floor) {
     for (const int cases : cases_hit) CHECK(cases >= 5);
     const Contact ground{0, kGround, ContactType::vertex_patch, 0, -1};
     const Pose high{Mat3::Identity(), Vec3(0, 0, 2)}, low{Mat3::Identity(), Vec3(0, 0, -2)};
-    const double toi = contact_toi(model, ground, {high, low}, {}, 0.0, options);  // the vertex from 1.6 to -2.4
+    const double toi = contact_toi(
+        ground, {{&model.bodies[0].mesh, &high, nullptr}, {&model.bodies[0].mesh, &low, nullptr}}, {}, 0.0,
+        options);  // the vertex from 1.6 to -2.4
     CHECK(toi <= 1.55 / 4.0);
     CHECK(toi >= 1.55 / 4.0 - options.tolerance);
 }

@@ -48,8 +48,8 @@ struct Problem {
     }
     int solve(Coordinates& p) const {
         BlockSystem system;
-        system.set_pattern(zone.dynamic_count, zone.pairs);
-        return solve_impact_qp(zone, inertial_gradient, mass_factor, rows, system, p);
+        system.set_pattern(base_pattern(zone));
+        return solve_impact_qp(zone, inertial_gradient, mass_factor, nullptr, rows, system, p);
     }
     /// The dual, one multiplier at a time:  p = M⁻¹ (Σ λ r - g),  0 ≤ λ = stiffness · violation. Slow and plain.
     VectorX reference(int sweeps) const {
@@ -81,7 +81,7 @@ Problem random_problem(check::Random& random, int bodies, int row_count, double 
     for (int i = 0; i < bodies; ++i) {
         const double mass = random.uniform(0.5, 5.0);
         zone.bodies.push_back(fixtures::zone_body(i, Pose(), mass, mass * fixtures::random_inertia(random, 4.0)));
-        problem.inertial_gradient.push_back(random.vector(6));
+        problem.inertial_gradient.bodies.push_back(random.vector(6));
         problem.mass_factor.push_back(i % 2 == 0 ? 1.0 : 3.0);
         for (int j = i + 1; j < bodies; ++j) zone.pairs.emplace_back(i, j);
     }
@@ -148,7 +148,7 @@ TEST(impact_qp_agrees_with_a_slow_reference) {
     for (int k = 0; k < 20; ++k) {
         NOTE(k);
         const Problem problem = random_problem(random, 1 + k % 4, 3 + k % 7, 100.0);
-        Coordinates p(static_cast<std::size_t>(problem.zone.dynamic_count), Vec6::Zero());
+        Coordinates p = fixtures::unflatten(VectorX::Zero(problem.size()));
         problem.solve(p);
         const VectorX found = flatten(p), reference = problem.reference(4000);
         CHECK_NEAR(found, reference, 1e-7 * (1.0 + reference.norm()));  // what the solver's tolerance is worth in p
@@ -164,7 +164,7 @@ TEST(impact_qp_does_not_depend_on_the_start) {
     for (int k = 0; k < 10; ++k) {
         NOTE(k);
         const Problem problem = random_problem(random, 3, 10, 1e4);
-        Coordinates near(3, Vec6::Zero()), far = fixtures::unflatten(100.0 * random.vector(18));
+        Coordinates near = fixtures::unflatten(VectorX::Zero(18)), far = fixtures::unflatten(100.0 * random.vector(18));
         problem.solve(near);
         problem.solve(far);
         CHECK(flatten(near).norm() > 1e-3);
@@ -175,7 +175,7 @@ TEST(impact_qp_does_not_depend_on_the_start) {
 TEST(without_rows_bodies_go_to_their_targets) {
     check::Random random(4);
     const Problem problem = random_problem(random, 2, 0, 1.0);
-    Coordinates p(2, Vec6::Zero());
+    Coordinates p = fixtures::unflatten(VectorX::Zero(12));
     problem.solve(p);
     const VectorX expected = -(problem.mass().inverse() * flatten(problem.inertial_gradient));
     CHECK_NEAR(flatten(p), expected, 1e-13);
@@ -186,11 +186,15 @@ TEST(a_row_that_wants_more_is_met_as_far_as_masses_and_stiffness_say) {
     Problem problem;
     problem.zone.dynamic_count = 1;
     problem.zone.bodies.push_back(fixtures::zone_body(0, Pose(), 2.0, Mat3::Identity()));
-    problem.inertial_gradient.assign(1, Vec6::Zero());
+    problem.inertial_gradient.assign_zero(1, 0);
     problem.mass_factor = {1.0};
-    ImpactRow row{0, -1, -1, Vec6::Unit(5), Vec6::Zero(), 0.3, 6.0};
+    ImpactRow row;
+    row.a = 0;
+    row.row_a = Vec6::Unit(5);
+    row.missing = 0.3;
+    row.stiffness = 6.0;
     problem.rows.push_back(row);
-    Coordinates p(1, Vec6::Zero());
+    Coordinates p = fixtures::unflatten(VectorX::Zero(6));
     problem.solve(p);
-    CHECK_NEAR(p[0], 0.3 * 6.0 / 8.0 * Vec6::Unit(5), 1e-14);
+    CHECK_NEAR(p.bodies[0], 0.3 * 6.0 / 8.0 * Vec6::Unit(5), 1e-14);
 }

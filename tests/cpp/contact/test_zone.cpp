@@ -73,13 +73,13 @@ Zone random_zone(const Model& model, check::Random& random, Coordinates& y) {
     zone.model = &model;
     zone.dynamic_count = 3;
     zone.ground_height = model.ground.height;
-    y.clear();
+    y = Coordinates();
     const Vec3 places[5] = {{-0.8, 0, -0.4}, {0.8, 0.1, -0.3}, {0, 0, 0.95}, {0, 1.35, 0}, {0, -1.2, 0}};
     for (int i = 0; i < 5; ++i) {
         Vec6 coordinates;
         coordinates << random.uniform(0.2, 2.0) * fixtures::random_direction(random), random_vec3(random, 0.5);
         if (i == 3) coordinates.setZero();
-        y.push_back(coordinates);
+        y.bodies.push_back(coordinates);
         const Mat3 R = random_rotation(random);
         const Pose start{
             exp_rotation(coordinates.head<3>()).transpose() * R,
@@ -98,7 +98,7 @@ Zone random_zone(const Model& model, check::Random& random, Coordinates& y) {
 ZonePoint point_at(const Zone& zone, const Coordinates& y, const VectorX& change) {
     ZonePoint point;
     point.y = y;
-    for (int i = 0; i < zone.dynamic_count; ++i) point.y[i] += change.segment<6>(6 * i);
+    for (int i = 0; i < zone.dynamic_count; ++i) point.y.bodies[i] += change.segment<6>(6 * i);
     evaluate(zone, point);
     return point;
 }
@@ -132,7 +132,7 @@ struct Derivatives {
 Derivatives derivatives_at(const Zone& zone, const ZonePoint& point, Curvature curvature) {
     ZoneDerivatives derivatives;
     BlockSystem system;
-    system.set_pattern(zone.dynamic_count, zone.pairs);
+    system.set_pattern(base_pattern(zone));
     differentiate(zone, point, curvature, derivatives, &system);
     return {flatten(derivatives.gradient), curvature == Curvature::none ? MatrixX() : dense(system)};
 }
@@ -212,14 +212,14 @@ TEST(dropped_curvature_leaves_mass_and_rows) {
             const ZoneContact& contact = zone.contacts[active.index];
             const bool ground = contact.contact.with_ground();
             const Vec3 center_b = ground ? Vec3(Vec3::Zero()) : point.poses[contact.b].t;
-            const ContactDerivatives d = contact_derivatives(
-                active.geometry, contact.range, contact.stiffness.value, point.poses[contact.a].t, center_b, true,
-                false);
+            const auto d = contact_derivatives(
+                active.geometry, contact.range, contact.stiffness.value, BodySide{point.poses[contact.a].t},
+                BodySide{center_b}, true, false);
             VectorX row = VectorX::Zero(18);
             if (contact.a < 3)
-                row.segment<6>(6 * contact.a) = chart_jacobian(y[contact.a]).transpose() * d.row.head<6>();
+                row.segment<6>(6 * contact.a) = chart_jacobian(y.bodies[contact.a]).transpose() * d.row.head<6>();
             if (contact.b >= 0 && contact.b < 3)
-                row.segment<6>(6 * contact.b) = chart_jacobian(y[contact.b]).transpose() * d.row.tail<6>();
+                row.segment<6>(6 * contact.b) = chart_jacobian(y.bodies[contact.b]).transpose() * d.row.tail<6>();
             expected += d.stiffness * row * row.transpose();
         }
         const Derivatives dropped = derivatives_at(zone, point, Curvature::dropped);
@@ -261,7 +261,7 @@ TEST(energy_without_contact_is_inertial) {
     zone.contacts.clear();
     const ZonePoint point = point_at(zone, y, VectorX::Zero(18));
     VectorX error(18);
-    for (int i = 0; i < 3; ++i) error.segment<6>(6 * i) = y[i] - zone.bodies[i].target;
+    for (int i = 0; i < 3; ++i) error.segment<6>(6 * i) = y.bodies[i] - zone.bodies[i].target;
     CHECK_NEAR(point.energy, 0.5 * error.dot(mass_matrix(zone) * error), 1e-13 * point.energy);
     CHECK(point.contact_energy == 0.0);
     CHECK_NEAR(derivatives_at(zone, point, Curvature::exact).gradient, mass_matrix(zone) * error, 1e-13 * point.energy);
