@@ -3,6 +3,7 @@
 from typing import Any
 
 from . import diagnostics, rotation, shapes
+from .materials import ClothMaterial
 from .ops import ConvergenceWarning, Info, SolverError
 from .scene import BodyHandle, Scene
 from .simulator import Simulator
@@ -10,6 +11,7 @@ from .state import Control, State
 
 __all__ = [
     "BodyHandle",
+    "ClothMaterial",
     "Control",
     "ConvergenceWarning",
     "Info",
