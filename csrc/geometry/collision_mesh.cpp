@@ -2,7 +2,6 @@
 
 #include <Eigen/Geometry>
 #include <algorithm>
-#include <map>
 #include <stdexcept>
 
 namespace diffsim {
@@ -15,19 +14,9 @@ using Triangle = Eigen::Vector3i;
 /// thickness (1e-3 of the size by default).
 constexpr double kCoplanarTolerance = 1e-7;
 
-/// The faces on both sides of each mesh edge, keyed by its sorted vertex pair.
-using EdgeFaces = std::map<std::pair<int, int>, std::vector<int>>;
-
 std::pair<int, int> edge_key(int i, int j) { return {std::min(i, j), std::max(i, j)}; }
 
-EdgeFaces collect_edge_faces(const std::vector<Triangle>& triangles) {
-    EdgeFaces result;
-    for (int f = 0; f < static_cast<int>(triangles.size()); ++f)
-        for (int k = 0; k < 3; ++k) result[edge_key(triangles[f][k], triangles[f][(k + 1) % 3])].push_back(f);
-    return result;
-}
-
-/// Grows convex coplanar patches over the faces of one mesh.
+/// Makes patches of the faces of one mesh.
 class PatchBuilder {
 public:
     PatchBuilder(
@@ -41,7 +30,15 @@ public:
             m_normals.push_back((vertices[f[1]] - vertices[f[0]]).cross(vertices[f[2]] - vertices[f[0]]).normalized());
     }
 
-    std::vector<Patch> build() {
+    std::vector<Patch> one_per_face() const {
+        std::vector<Patch> patches;
+        for (std::size_t f = 0; f < m_triangles.size(); ++f)
+            patches.push_back({{m_triangles[f][0], m_triangles[f][1], m_triangles[f][2]}, m_normals[f]});
+        return patches;
+    }
+
+    /// Grow convex coplanar patches.
+    std::vector<Patch> merged() const {
         std::vector<Patch> patches;
         std::vector<char> used(m_triangles.size(), 0);
         for (int seed = 0; seed < static_cast<int>(m_triangles.size()); ++seed) {
@@ -158,7 +155,14 @@ void build_cells(CollisionMesh& mesh) {
 
 }  // namespace
 
-CollisionMesh build_collision_mesh(std::vector<Vec3> vertices, const std::vector<Triangle>& triangles) {
+EdgeFaces collect_edge_faces(const std::vector<Triangle>& triangles) {
+    EdgeFaces result;
+    for (int f = 0; f < static_cast<int>(triangles.size()); ++f)
+        for (int k = 0; k < 3; ++k) result[edge_key(triangles[f][k], triangles[f][(k + 1) % 3])].push_back(f);
+    return result;
+}
+
+CollisionMesh build_collision_mesh(std::vector<Vec3> vertices, const std::vector<Triangle>& triangles, Faces faces) {
     const int vertex_count = static_cast<int>(vertices.size());
     CollisionMesh mesh;
     mesh.vertices = std::move(vertices);
@@ -187,12 +191,14 @@ CollisionMesh build_collision_mesh(std::vector<Vec3> vertices, const std::vector
             if (t.minCoeff() < 0 || t.maxCoeff() >= vertex_count)
                 throw std::invalid_argument("face index out of range");
         const EdgeFaces edge_faces = collect_edge_faces(triangles);
-        PatchBuilder builder(mesh.vertices, triangles, edge_faces, (bounds.upper - bounds.lower).norm());
-        mesh.patches = builder.build();
+        const PatchBuilder builder(mesh.vertices, triangles, edge_faces, (bounds.upper - bounds.lower).norm());
+        const bool separate = faces == Faces::separate;
+        mesh.patches = separate ? builder.one_per_face() : builder.merged();
         mesh.closed = true;
-        for (const auto& [key, faces] : edge_faces) {
-            mesh.closed = mesh.closed && faces.size() == 2;
-            if (!builder.is_flat(faces)) mesh.edges.push_back({key.first, key.second, builder.outward(faces)});
+        for (const auto& [key, around] : edge_faces) {
+            mesh.closed = mesh.closed && around.size() == 2;
+            if (separate || !builder.is_flat(around))
+                mesh.edges.push_back({key.first, key.second, builder.outward(around)});
         }
         build_cells(mesh);
     }

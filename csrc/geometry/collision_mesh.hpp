@@ -1,5 +1,7 @@
 #pragma once
 
+#include <map>
+#include <utility>
 #include <vector>
 
 #include "geometry/box_tree.hpp"
@@ -27,11 +29,18 @@ struct Cell {
     std::vector<int> edges;
 };
 
-/// Collision view of a rigid triangle mesh, in the body frame. Constant over time.
-///
-/// Coplanar faces are merged into convex patches and edges between coplanar faces dropped, because the
-/// contact energy counts one term per (vertex, patch) and per (edge, edge) pair: a cube's face diagonal
-/// is no feature of a cube.
+/// What becomes a feature of a surface. `merged`: coplanar faces become convex patches and edges between coplanar
+/// faces are dropped, because the contact energy counts one term per (vertex, patch) and per (edge, edge) pair: a
+/// cube's face diagonal is no feature of a cube. `separate`: patch i is triangle i and every edge counts, for surfaces
+/// that deform, whose flat spots do not stay flat.
+enum class Faces { merged, separate };
+
+/// The triangles around each edge of a mesh, ascending, keyed by the edge's sorted vertex pair.
+using EdgeFaces = std::map<std::pair<int, int>, std::vector<int>>;
+EdgeFaces collect_edge_faces(const std::vector<Eigen::Vector3i>& triangles);
+
+/// Collision view of a triangle mesh, in the body frame. Constant over time; of a mesh that deforms only the topology
+/// is, while positions, normals and boxes are those of the vertices it was built from.
 struct CollisionMesh {
     std::vector<Vec3> vertices;
     std::vector<Patch> patches;
@@ -45,6 +54,7 @@ struct CollisionMesh {
 
 /// Build from vertices and triangles (indices into vertices). Without triangles: one vertex is a point,
 /// two are a segment. Throws std::invalid_argument on anything else.
-CollisionMesh build_collision_mesh(std::vector<Vec3> vertices, const std::vector<Eigen::Vector3i>& triangles);
+CollisionMesh build_collision_mesh(
+    std::vector<Vec3> vertices, const std::vector<Eigen::Vector3i>& triangles, Faces faces = Faces::merged);
 
 }  // namespace diffsim

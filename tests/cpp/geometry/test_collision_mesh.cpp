@@ -190,6 +190,27 @@ TEST(open_meshes_have_no_inside) {
     CHECK(two_sided.edges.size() == 3);
 }
 
+TEST(separate_faces_stay_triangles) {
+    const TriangleMesh cube = subdivided_cube(2);
+    const CollisionMesh mesh = build_collision_mesh(cube.vertices, cube.triangles, Faces::separate);
+    check_invariants(cube, mesh);
+    CHECK(mesh.patches.size() == cube.triangles.size());
+    for (std::size_t f = 0; f < cube.triangles.size(); ++f) {
+        const Eigen::Vector3i& t = cube.triangles[f];
+        CHECK(mesh.patches[f].vertices == std::vector<int>{t[0], t[1], t[2]});
+    }
+    CHECK(mesh.edges.size() == cube.triangles.size() * 3 / 2);
+    CHECK(mesh.active_vertices.size() == cube.vertices.size());
+    CHECK(mesh.closed);
+
+    const TriangleMesh square{{{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}}, {{0, 1, 2}, {0, 2, 3}}};
+    const CollisionMesh flat = build_collision_mesh(square.vertices, square.triangles, Faces::separate);
+    check_invariants(square, flat);
+    CHECK(flat.patches.size() == 2);
+    CHECK(flat.edges.size() == 5);
+    CHECK(!flat.closed);
+}
+
 TEST(points_and_segments) {
     const CollisionMesh point = build_collision_mesh({Vec3::Zero()}, {});
     CHECK(point.active_vertices == std::vector<int>{0});

@@ -1,0 +1,105 @@
+#pragma once
+
+#include <vector>
+
+#include "model/cloth.hpp"
+
+/// The elastic potential of one cloth over one step of implicit Euler, with its derivatives. Nodes are those of the
+/// cloth, from 0; pins are the caller's business.
+///
+/// Membrane, per triangle with deformation gradient F (3 x 2) and Green strain ε = ½ (FᵀF - 1):
+///   W(ε) = ½ E / (1 - ν²) (ε11² + ε22² + 2 ν ε11 ε22) + ½ G (2 ε12)²,  times the area at rest,
+/// with E = stretch, G = shear. Bending, per hinge with dihedral angle θ and rest angle θ0:
+///   ½ bend weight (θ - θ0)².
+/// Kelvin–Voigt damping, as the gain damping / dt on the same two forms of the change over the step, ε - ε_start and
+/// θ - θ_start, so that the step stays a minimization. Differences of angles are taken in (-π, π]: springs take the
+/// shorter way round, and the energy has a kink at half a turn.
+///
+/// The membrane is smooth everywhere. The angle is not defined at a hinge with a triangle collapsed to a line or point:
+/// while that lasts the hinge contributes nothing, and at the start of a step it counts as flat. All else is finite,
+/// though a hinge's forces grow as its triangles' heights fall.
+///
+/// Sums run in the order of triangles, then hinges: results depend on the input alone.
+namespace diffsim {
+
+/// Strains at the start of a step, which its damping is measured from.
+struct ElasticStart {
+    std::vector<Vec3> strain;   ///< per triangle: ε11, ε22, ε12 (1 warp, 2 weft) [1]
+    std::vector<double> angle;  ///< per hinge [rad]
+};
+
+ElasticStart elastic_start(const Cloth& cloth, const Vec3* x_start);
+
+/// [J]
+double elastic_energy(
+    const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x);
+
+/// gradient += scale * d(energy)/dx, minus the elastic forces [N].
+void add_elastic_gradient(
+    const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
+    double scale, Vec3* gradient);
+
+/// product += scale * (the exact Hessian) * direction.
+void add_elastic_hessian_product(
+    const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
+    const Vec3* direction, double scale, Vec3* product);
+
+/// Gradient of  s = scale * direction · d(energy)/dx  with respect to what the energy depends on besides x: added to
+/// grad_x_start through the start's strains, and returned for the parameters (density's is 0). With respect to x
+/// it is the Hessian product; with respect to dt it is -damping / dt times that with respect to damping.
+/// `start` is elastic_start(cloth, x_start).
+ClothParameters add_elastic_backward(
+    const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
+    const Vec3* x_start, const Vec3* direction, double scale, Vec3* grad_x_start);
+
+/// Which second derivative of an element. `projected` is positive semidefinite, and equals `exact` wherever that is:
+///  - Triangles: blocks (∂ε/∂xi)ᵀ C (∂ε/∂xj), always semidefinite, plus (giᵀ S gj) 1 with the stress S and the gradients
+///    g of the shape functions. Along the triangle's normal the latter stands alone, so that the whole is semidefinite
+///    exactly when S is: `projected` cuts S to its positive part, for a square root. Clamping the eigenvalues of
+///    the 9 x 9 matrix would differ within the triangle's plane, by the cut stress beside the stiffness, which is of the
+///    order of the strain.
+///  - Hinges: k ∇θ ∇θᵀ + moment ∇²θ. Any moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ
+///    with that away from the edge, against which the hinge has no stiffness. `projected` drops the moment's term.
+enum class ElasticHessian { exact, projected };
+
+/// Second derivative of the energy of one element by its nodes' positions [N/m].
+template <int NodeCount>
+struct ElementHessian {
+    using Matrix = Eigen::Matrix<double, 3 * NodeCount, 3 * NodeCount>;
+
+    int id;                            ///< of the triangle (three nodes) or the hinge (four) in the cloth
+    std::array<int, NodeCount> nodes;  ///< of the cloth
+    Matrix matrix;                     ///< symmetric, in the order of the nodes
+
+    auto block(int row, int column) const { return matrix.template block<3, 3>(3 * row, 3 * column); }
+};
+
+/// What all elements of one cloth and step have in common.
+struct ElasticLaw {
+    double c11, c12;         ///< of stress from ε11 and ε22 [N/m]
+    double shear;            ///< [N/m]
+    double bend;             ///< [N·m]
+    double damping_over_dt;  ///< [1]
+};
+
+ElasticLaw elastic_law(const Cloth& cloth, const ClothParameters& parameters, double dt);
+
+ElementHessian<3> triangle_hessian(
+    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int triangle,
+    ElasticHessian kind);
+ElementHessian<4> hinge_hessian(
+    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int hinge,
+    ElasticHessian kind);
+
+/// Call visit(element) with every triangle's ElementHessian<3>, then every hinge's ElementHessian<4>.
+template <class Visit>
+void visit_elastic_hessian(
+    const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
+    ElasticHessian kind, Visit&& visit) {
+    const ElasticLaw law = elastic_law(cloth, parameters, dt);
+    for (int t = 0; t < static_cast<int>(cloth.triangles.size()); ++t)
+        visit(triangle_hessian(cloth, law, start, x, t, kind));
+    for (int h = 0; h < static_cast<int>(cloth.hinges.size()); ++h) visit(hinge_hessian(cloth, law, start, x, h, kind));
+}
+
+}  // namespace diffsim
