@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "geometry/collision_mesh.hpp"
+#include "model/cloth.hpp"
 
 /// What a scene is made of. Constant over time, shared by every step, thread and batch element.
 namespace diffsim {
@@ -33,11 +34,20 @@ inline constexpr int kNobody = -2;
 
 struct Model {
     std::vector<Body> bodies;
+    std::vector<Cloth> cloths;
     Ground ground;
     double thickness = 0.0;  ///< distance kept between surfaces of default margin [m]
 
     int body_count() const { return static_cast<int>(bodies.size()); }
-    double margin(int object) const { return object == kGround ? ground.margin : bodies[object].margin; }
+    int cloth_count() const { return static_cast<int>(cloths.size()); }
+    int node_count() const { return cloths.empty() ? 0 : cloths.back().first_node + cloths.back().node_count(); }
+
+    // Objects are the bodies, then the cloths, or kGround.
+    bool is_cloth(int object) const { return object >= body_count(); }
+    const Cloth& cloth_of(int object) const { return cloths[object - body_count()]; }
+    double margin(int object) const {
+        return object == kGround ? ground.margin : is_cloth(object) ? cloth_of(object).margin : bodies[object].margin;
+    }
     const std::string& name(int object) const;
 };
 
@@ -53,15 +63,7 @@ struct Options {
     AdjointMode adjoint = AdjointMode::exact;  ///<
     double tolerance = 1e-10;                  ///< on the force balance, relative to the largest contact force [1]
     int max_iterations = 200;                  ///< Newton steps per zone and step
-};
-
-/// Physical parameters of one cloth.
-struct ClothParameters {
-    double density = 0.0;  ///< [kg/m²]
-    double stretch = 0.0;  ///< uniaxial stress resultant per strain [N/m]
-    double shear = 0.0;    ///< [N/m]
-    double bend = 0.0;     ///< bending moment per curvature and width [N·m]
-    double damping = 0.0;  ///< [s]
+    bool split = false;  ///< cloth moves without contact first, then contacts act on its nodes (split coupling)
 };
 
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.
