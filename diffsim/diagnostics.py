@@ -218,7 +218,7 @@ def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps:
         given = dict(zip(CONTROL_FIELDS, over_time(where, controls, steps, state.dtype, *counts, batch)[0]))
     inputs.update({_CONTROL_NAMES[k]: t.detach().to(torch.float64) for k, t in given.items() if t is not None})
     inputs.update({name: getattr(sim, name).detach().to(torch.float64) for name in parameters})
-    return inputs
+    return {name: t for name, t in inputs.items() if t.numel()}  # without bodies there is nothing to move of them
 
 
 def _normal(shape: torch.Size, generator: torch.Generator) -> Tensor:

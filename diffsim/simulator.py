@@ -436,7 +436,8 @@ class Simulator(Measurements):
         none_moves = None if dynamic else "no dynamic body"
         stage("free motion", none_moves)
         stage("kinematic motion", None if kinematic else "no kinematic body")
-        stage("ground contact", none_moves if self._packed.has_ground else "no ground")
+        nothing_moves = None if self._node_count else none_moves
+        stage("ground contact", nothing_moves if self._packed.has_ground else "no ground")
         stage("body-body contact", none_moves or (None if n > 1 else "one body"))
         stage("friction", "not in this version")
         stage("restitution", "not in this version")
