@@ -53,13 +53,14 @@ ClothParameters add_elastic_backward(
     const Vec3* x_start, const Vec3* direction, double scale, Vec3* grad_x_start);
 
 /// Which second derivative of an element. `projected` is positive semidefinite, and equals `exact` wherever that is:
-///  - Triangles: blocks (∂ε/∂xi)ᵀ C (∂ε/∂xj), always semidefinite, plus (giᵀ S gj) 1 with the stress S and the gradients
-///    g of the shape functions. Along the triangle's normal the latter stands alone, so that the whole is semidefinite
-///    exactly when S is: `projected` cuts S to its positive part, for a square root. Clamping the eigenvalues of
-///    the 9 x 9 matrix would differ within the triangle's plane, by the cut stress beside the stiffness, which is of the
-///    order of the strain.
+///  - Triangles: blocks (∂ε/∂xi)ᵀ C (∂ε/∂xj), always semidefinite, plus (giᵀ S gj) 1 with the stress S and the
+///    gradients g of the shape functions. Along the triangle's normal the latter stands alone, so that the whole is
+///    semidefinite exactly when S is: `projected` cuts S to its positive part, for a square root. Clamping the
+///    eigenvalues of the 9 x 9 matrix would differ within the triangle's plane, by the cut stress beside the stiffness,
+///    which is of the order of the strain.
 ///  - Hinges: k ∇θ ∇θᵀ + moment ∇²θ. Any moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ
 ///    with that away from the edge, against which the hinge has no stiffness. `projected` drops the moment's term.
+/// Clamping eigenvalues instead would take some 4 µs per triangle and 7 µs per hinge, thirty times as long or more.
 enum class ElasticHessian { exact, projected };
 
 /// Second derivative of the energy of one element by its nodes' positions [N/m].

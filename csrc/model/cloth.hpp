@@ -51,8 +51,9 @@ struct ClothParameters {
 /// where it is nearly normal to that plane, the coordinate axis least aligned with it takes its place.
 ///
 /// Neighbouring triangles may be given in opposite senses. Throws std::invalid_argument, naming the triangle, edge or
-/// node, for no triangle at all, indices out of range, triangles without area, edges of more than two triangles, two triangles with
-/// the same corners, nodes without a triangle (they would have no mass), and a warp without direction.
+/// node, for indices out of range, triangles without area, edges of more than two triangles, two triangles with
+/// the same corners, and nodes without a triangle (they would have no mass); and for no triangles at all or a warp of
+/// length 0.
 Cloth build_cloth(std::vector<Vec3> rest, const std::vector<Eigen::Vector3i>& triangles, const Vec3& warp);
 
 }  // namespace diffsim

@@ -140,7 +140,7 @@ Nodes mapped(Nodes x, const Mat3& map) { return moved(std::move(x), map, Vec3::Z
 
 }  // namespace
 
-// --- the energy ----------------------------------------------------------------------------------------------------------
+// --- the energy ------------------------------------------------------------------------------------------------------
 
 TEST(energy_is_the_one_written_down) {
     check::Random random(1);
@@ -300,7 +300,7 @@ TEST(numbering_does_not_matter) {
     }
 }
 
-// --- derivatives by x ----------------------------------------------------------------------------------------------------
+// --- derivatives by x ------------------------------------------------------------------------------------------------
 
 TEST(gradient_and_hessian_agree_with_differences) {
     check::Random random(4);
@@ -401,7 +401,7 @@ TEST(a_flat_sheet_under_tension_needs_no_projection) {
     CHECK(problem.hessian(ElasticHessian::projected) == problem.hessian(ElasticHessian::exact));
 }
 
-// --- damping -------------------------------------------------------------------------------------------------------------
+// --- damping ---------------------------------------------------------------------------------------------------------
 
 TEST(damping_is_silent_without_deformation) {
     check::Random random(8);
@@ -442,7 +442,7 @@ TEST(damping_relaxes_over_its_time) {
     CHECK(largest(problem.gradient()) < kRounding * 50.0);
 }
 
-// --- backward ------------------------------------------------------------------------------------------------------------
+// --- backward --------------------------------------------------------------------------------------------------------
 
 TEST(elastic_backward_agrees_with_differences) {
     check::Random random(10);
@@ -507,7 +507,7 @@ TEST(undamped_steps_still_know_their_gradient_by_damping) {
     CHECK_NEAR(grad.damping, s(1.0) - s(0.0), 1e-10 * std::abs(grad.damping));
 }
 
-// --- degenerate shapes ---------------------------------------------------------------------------------------------------
+// --- degenerate shapes -----------------------------------------------------------------------------------------------
 
 TEST(collapsed_sheets_have_finite_forces) {
     const Cloth cloth = build(fixtures::grid(3, 3, 0.5), {1, 0.2, 0}, 0.2);

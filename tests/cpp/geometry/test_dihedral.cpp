@@ -23,7 +23,7 @@ VectorX as_vector(const Mat34& points) { return points.reshaped(); }
 
 Mat34 as_points(const VectorX& x) { return x.reshaped(3, 4); }
 
-/// From the unit normals and their cosine, with the side found by the corner of one triangle and the plane of the other.
+/// From the unit normals and their cosine, on the side that one's corner has of the other's plane.
 double obvious_angle(const Mat34& points) {
     const Vec3 p0 = points.col(0), p1 = points.col(1), a = points.col(2), b = points.col(3);
     const Vec3 normal_a = (p1 - p0).cross(a - p0).normalized(), normal_b = (b - p0).cross(p1 - p0).normalized();
