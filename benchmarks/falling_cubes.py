@@ -62,7 +62,8 @@ def tape_bytes(sim: ds.Simulator, start: ds.State) -> int:
     """Of the whole rollout; not public, so asked of the operator."""
     call = RolloutCall(sim._model, sim._options, STEPS, 1, keep_time=True)
     inputs = [start.position, start.orientation, start.velocity, start.angular_velocity]
-    rollout(call, *inputs, None, None, None, None, sim.mass, sim.inertia, sim.gravity)
+    no_cloth_nor_controls = (None,) * 8
+    rollout(call, *inputs, *no_cloth_nor_controls, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
     assert isinstance(call.tape, _core.Tape)
     return call.tape.nbytes
 

@@ -1,8 +1,8 @@
 """What a step costs beside its physics: one free body, one step, called from Python.
 
-Timed beside a do-nothing autograd.Function of the same arity (11 tensors in, 4 out), in turns, in the same process:
-forward through `Simulator.__call__` with gradients recorded, and backward to the whole state. Prints one CSV line per
-run; the ratios should be at most 2.
+Timed beside a do-nothing autograd.Function of the same arity (20 tensors in, 6 out; those of cloth are None), in turns,
+in the same process: forward through `Simulator.__call__` with gradients recorded, and backward to the whole state.
+Prints one CSV line per run; the ratios should be at most 2.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ COLUMNS += ("nothing_backward_us", "step_backward_us", "backward_ratio")
 
 
 class Nothing(torch.autograd.Function):
-    """As `diffsim.ops` has it: an object and 11 tensors (or None) in, 4 tensors out."""
+    """As `diffsim.ops` has it: an object and 20 tensors (or None) in, 6 tensors (or None) out."""
 
     @staticmethod
-    def forward(call: object, *inputs: Tensor | None) -> tuple[Tensor, ...]:
-        return tuple(t.clone() for t in inputs[:4] if t is not None)
+    def forward(call: object, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        return tuple(None if t is None else t.clone() for t in inputs[:6])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -37,7 +37,7 @@ class Nothing(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return (None, *grads, *(None,) * 7)
+        return (None, *grads, *(None,) * 14)
 
 
 def cases() -> dict[str, Callable[[], object]]:
@@ -47,10 +47,10 @@ def cases() -> dict[str, Callable[[], object]]:
     sim = ds.Simulator(scene, dt=0.01)
     start = sim.initial_state()
     inputs = [t.requires_grad_() for t in (start.position, start.orientation, start.velocity, start.angular_velocity)]
-    arguments = (object(), *inputs, None, None, None, None, sim.mass, sim.inertia, sim.gravity)
+    arguments = (object(), *inputs, *(None,) * 8, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
     end = sim(start)
     stepped = (end.position, end.orientation, end.velocity, end.angular_velocity)
-    unchanged = Nothing.apply(*arguments)
+    unchanged = Nothing.apply(*arguments)[:4]
     upstream = [torch.ones_like(t) for t in stepped]
     return {
         "nothing_forward": lambda: Nothing.apply(*arguments),

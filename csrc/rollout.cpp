@@ -73,6 +73,27 @@ void require_finite(const char* field, const Model& model, int body, const Vecto
     refuse(field, model, body, text.str());
 }
 
+[[noreturn]] void refuse_node(const std::string& field, const Model& model, int node, const Vec3& value) {
+    std::size_t cloth = 0;
+    while (node >= model.cloths[cloth].first_node + model.cloths[cloth].node_count()) ++cloth;
+    std::ostringstream text;
+    text << field << " of node " << node - model.cloths[cloth].first_node << " of cloth '" << model.cloths[cloth].name
+         << "' (index " << node << ") must be finite, got (" << value.transpose() << ")";
+    throw std::invalid_argument(text.str());
+}
+
+/// One row per node; zeros where nothing is given.
+void read_nodes(
+    const char* field, const Model& model, const BatchedView<const double>& view, int time, int scene,
+    std::vector<Vec3>& nodes) {
+    nodes.assign(static_cast<std::size_t>(model.node_count()), Vec3::Zero());
+    if (!view.present()) return;
+    for (int i = 0; i < model.node_count(); ++i) {
+        nodes[i] = row<3>(view.at(time, scene), i);
+        if (!nodes[i].allFinite()) refuse_node(field, model, i, nodes[i]);
+    }
+}
+
 SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
     SceneState state;
     state.bodies.resize(model.bodies.size());
@@ -93,17 +114,36 @@ SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
                 "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) + "; divide it by its norm");
         if (std::abs(norm - 1.0) > 4.0 * kEpsilon) body.orientation /= norm;  // bits of our own states stay
     }
+    if (!model.cloths.empty()) {
+        read_nodes("state.node_position", model, in.node_position, 0, scene, state.node_position);
+        read_nodes("state.node_velocity", model, in.node_velocity, 0, scene, state.node_velocity);
+    }
     return state;
 }
 
 /// Steps keep what is apart apart; what crosses to begin with they would keep crossed.
 void refuse_crossing(const Model& model, const SceneState& state) {
-    if (model.body_count() < 2) return;
+    if (model.body_count() < 2 && model.cloths.empty()) return;
     const CrossingObjects crossing = find_crossing(model, state);
     if (crossing.a == kNobody) return;
+    if (crossing.a == crossing.b)
+        throw std::invalid_argument(
+            "state: the mesh of '" + model.name(crossing.a) +
+            "' crosses itself; start from a state in which it does not");
     throw std::invalid_argument(
         "state: the meshes of '" + model.name(crossing.a) + "' and '" + model.name(crossing.b) +
         "' cross; start from a state in which they are apart");
+}
+
+double read_cloth_parameter(
+    const char* field, const char* unit, bool may_be_zero, const Model& model, const BatchedView<const double>& view,
+    int cloth, int scene) {
+    const double value = view.at(0, scene)[cloth];
+    if (std::isfinite(value) && (value > 0.0 || (may_be_zero && value == 0.0))) return value;
+    std::ostringstream text;
+    text << field << " of cloth '" << model.cloths[cloth].name << "' (index " << cloth << ") must be "
+         << (may_be_zero ? "zero or positive" : "positive") << " and finite, got " << value << " " << unit;
+    throw std::invalid_argument(text.str());
 }
 
 Parameters read_parameters(const Model& model, const RolloutInputs& in, int scene) {
@@ -122,6 +162,15 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
             refuse("mass", model, i, "must be positive and finite, got " + std::to_string(parameters.mass[i]) + " kg");
         if (!parameters.inertia[i].allFinite() || parameters.inertia[i].llt().info() != Eigen::Success)
             refuse("inertia", model, i, "must be positive definite");
+    }
+    for (int i = 0; i < model.cloth_count(); ++i) {
+        ClothParameters cloth;
+        cloth.density = read_cloth_parameter("cloth_density", "kg/m²", false, model, in.cloth_density, i, scene);
+        cloth.stretch = read_cloth_parameter("cloth_stretch", "N/m", false, model, in.cloth_stretch, i, scene);
+        cloth.shear = read_cloth_parameter("cloth_shear", "N/m", false, model, in.cloth_shear, i, scene);
+        cloth.bend = read_cloth_parameter("cloth_bend", "N·m", false, model, in.cloth_bend, i, scene);
+        cloth.damping = read_cloth_parameter("cloth_damping", "s", true, model, in.cloth_damping, i, scene);
+        parameters.cloths.push_back(cloth);
     }
     return parameters;
 }
@@ -144,6 +193,9 @@ void read_control(
         body.angular_velocity =
             read("control.body_angular_velocity", in.body_angular_velocity, i, state.bodies[i].angular_velocity);
     }
+    if (model.cloths.empty()) return;
+    read_nodes("control.node_force", model, in.node_force, time, scene, control.node_force);
+    read_nodes("control.node_velocity", model, in.node_drive, time, scene, control.node_velocity);
 }
 
 void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene) {
@@ -152,6 +204,10 @@ void write_state(const SceneState& state, const TrajectoryArrays<double>& out, i
         row<4>(out.orientation.at(time, scene), i) = state.bodies[i].orientation;
         row<3>(out.velocity.at(time, scene), i) = state.bodies[i].velocity;
         row<3>(out.angular_velocity.at(time, scene), i) = state.bodies[i].angular_velocity;
+    }
+    for (int i = 0; i < static_cast<int>(state.node_position.size()); ++i) {
+        row<3>(out.node_position.at(time, scene), i) = state.node_position[i];
+        row<3>(out.node_velocity.at(time, scene), i) = state.node_velocity[i];
     }
 }
 
@@ -190,6 +246,12 @@ void add_upstream(
             g.orientation += quaternion_gradient_to_covector(
                 end.bodies[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
     }
+    for (int i = 0; i < static_cast<int>(gradient.node_position.size()); ++i) {
+        if (upstream.node_position.present())
+            gradient.node_position[i] += row<3>(upstream.node_position.at(time, scene), i);
+        if (upstream.node_velocity.present())
+            gradient.node_velocity[i] += row<3>(upstream.node_velocity.at(time, scene), i);
+    }
 }
 
 /// State at the end of a recorded step: the start of the next one, or for the last step the same arithmetic again.
@@ -212,13 +274,16 @@ SceneGradient scene_backward(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream, int scene,
     bool keep_controls) {
     const Model& model = *tape.model;
-    const std::size_t count = model.bodies.size();
+    const std::size_t count = model.bodies.size(), node_count = static_cast<std::size_t>(model.node_count());
     const Parameters parameters = read_parameters(model, inputs, scene);
     SceneGradient gradient;
     gradient.state.bodies.resize(count);
+    gradient.state.node_position.assign(node_count, Vec3::Zero());
+    gradient.state.node_velocity.assign(node_count, Vec3::Zero());
     if (keep_controls) gradient.control.resize(static_cast<std::size_t>(tape.shape.steps));
     gradient.parameters.mass.assign(count, 0.0);
     gradient.parameters.inertia.assign(count, Mat3::Zero());
+    gradient.parameters.cloths.assign(model.cloths.size(), ClothParameters{});
     StepWorkspace workspace;
     SceneControl control;
     SceneControlGradient scratch;
@@ -231,6 +296,8 @@ SceneGradient scene_backward(
         read_control(model, inputs, time, scene, record.start, control);
         SceneControlGradient& control_gradient = keep_controls ? gradient.control[time] : scratch;
         control_gradient.bodies.assign(count, BodyControl{});
+        control_gradient.node_force.assign(node_count, Vec3::Zero());
+        control_gradient.node_velocity.assign(node_count, Vec3::Zero());
         step_backward(
             model, tape.options, parameters, control, record, workspace, gradient.state, control_gradient,
             gradient.parameters);
@@ -244,6 +311,37 @@ SceneGradient scene_backward(
         }
     }
     return gradient;
+}
+
+void write_cloth_gradient(
+    const Model& model, const RolloutArrays<double>& out, int scene, const SceneGradient& gradient) {
+    const auto add3 = [](const BatchedView<double>& view, int time, int batch, int node, const Vec3& value) {
+        if (view.present()) row<3>(view.at(time, batch), node) += value;
+    };
+    const auto add = [&](const BatchedView<double>& view, int cloth, double value) {
+        if (view.present()) view.at(0, scene)[cloth] += value;
+    };
+    for (int k = 0; k < model.cloth_count(); ++k) {
+        const ClothParameters& parameters = gradient.parameters.cloths[k];
+        add(out.cloth_density, k, parameters.density);
+        add(out.cloth_stretch, k, parameters.stretch);
+        add(out.cloth_shear, k, parameters.shear);
+        add(out.cloth_bend, k, parameters.bend);
+        add(out.cloth_damping, k, parameters.damping);
+        const Cloth& cloth = model.cloths[k];
+        for (int local = 0; local < cloth.node_count(); ++local) {
+            const int node = cloth.first_node + local;
+            add3(out.node_position, 0, scene, node, gradient.state.node_position[node]);
+            add3(out.node_velocity, 0, scene, node, gradient.state.node_velocity[node]);
+            for (int time = 0; time < static_cast<int>(gradient.control.size()); ++time) {
+                const SceneControlGradient& control = gradient.control[time];
+                if (cloth.pinned[local])
+                    add3(out.node_drive, time, scene, node, control.node_velocity[node]);
+                else
+                    add3(out.node_force, time, scene, node, control.node_force[node]);
+            }
+        }
+    }
 }
 
 void write_gradient(
@@ -277,6 +375,7 @@ void write_gradient(
         }
     }
     if (out.gravity.present()) row<3>(out.gravity.at(0, scene), 0) += gradient.parameters.gravity;
+    write_cloth_gradient(*tape.model, out, scene, gradient);
 }
 
 }  // namespace
@@ -341,8 +440,9 @@ void rollout_backward(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
     const RolloutArrays<double>& gradient, int thread_count) {
     std::vector<SceneGradient> scenes(static_cast<std::size_t>(tape.shape.batch));
-    const bool keep_controls = gradient.force.present() || gradient.torque.present() ||
-                               gradient.body_velocity.present() || gradient.body_angular_velocity.present();
+    const bool keep_controls = gradient.force.present() || gradient.torque.present() || gradient.node_force.present() ||
+                               gradient.body_velocity.present() || gradient.body_angular_velocity.present() ||
+                               gradient.node_drive.present();
     for_each_scene(tape.shape.batch, thread_count, [&](int scene, int) {
         scenes[scene] = scene_backward(tape, inputs, upstream, scene, keep_controls);
     });

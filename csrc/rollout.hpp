@@ -22,16 +22,20 @@ struct BatchedView {
 /// The inputs of a rollout, or gradients of the same shapes.
 template <typename T>
 struct RolloutArrays {
-    BatchedView<T> position, orientation, velocity, angular_velocity;    // state: n x 3, n x 4, n x 3, n x 3
-    BatchedView<T> force, torque, body_velocity, body_angular_velocity;  // controls, n x 3 each
-    BatchedView<T> mass, inertia, gravity;                               // n, n x 3 x 3, 3
+    // State: n x 3, n x 4, n x 3, n x 3; k x 3, k x 3 with k cloth nodes. All of cloth is absent in scenes without.
+    BatchedView<T> position, orientation, velocity, angular_velocity, node_position, node_velocity;
+    // Controls: n x 3, n x 3, k x 3; n x 3, n x 3, k x 3. The drive is the velocity of pinned nodes.
+    BatchedView<T> force, torque, node_force, body_velocity, body_angular_velocity, node_drive;
+    // Parameters: n, n x 3 x 3, 3; one per cloth.
+    BatchedView<T> mass, inertia, gravity;
+    BatchedView<T> cloth_density, cloth_stretch, cloth_shear, cloth_bend, cloth_damping;
 };
 using RolloutInputs = RolloutArrays<const double>;
 
 /// A trajectory, or the gradient with respect to one.
 template <typename T>
 struct TrajectoryArrays {
-    BatchedView<T> position, orientation, velocity, angular_velocity;
+    BatchedView<T> position, orientation, velocity, angular_velocity, node_position, node_velocity;
 };
 
 struct RolloutShape {
@@ -61,7 +65,7 @@ struct RolloutInfo {
 
 /// Advance `shape.batch` scenes by `shape.steps`, on up to `thread_count` threads; the result does not depend on it.
 /// `signatures`, steps x batch, receives a hash of each step's active contacts. Throws std::invalid_argument on values
-/// that make no sense, naming the body, the field and the value.
+/// that make no sense, naming the body, node or cloth, the field and the value.
 RolloutInfo rollout(
     const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
     const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory, std::vector<std::uint64_t>& signatures,

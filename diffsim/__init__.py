@@ -3,13 +3,16 @@
 from typing import Any
 
 from . import diagnostics, rotation, shapes
+from .materials import ClothMaterial
 from .ops import ConvergenceWarning, Info, SolverError
-from .scene import BodyHandle, Scene
+from .scene import BodyHandle, ClothHandle, Scene
 from .simulator import Simulator
 from .state import Control, State
 
 __all__ = [
     "BodyHandle",
+    "ClothHandle",
+    "ClothMaterial",
     "Control",
     "ConvergenceWarning",
     "Info",

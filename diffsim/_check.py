@@ -11,9 +11,11 @@ from torch import Tensor
 
 from .state import Control, State
 
-STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")  # of bodies, in the order of the core
-CONTROL_FIELDS = ("force", "torque", "body_velocity", "body_angular_velocity")  # of bodies, in the order of the core
-NODE_CONTROL_FIELDS = ("node_force", "node_velocity")
+# In the order of the core; fields of cloth nodes start with "node".
+STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
+CONTROL_FIELDS = ("force", "torque", "node_force", "body_velocity", "body_angular_velocity", "node_velocity")
+PARAMETERS = ("mass", "inertia", "gravity")
+CLOTH_PARAMETERS = ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend", "cloth_damping")
 FLOAT_DTYPES = (torch.float32, torch.float64)
 
 

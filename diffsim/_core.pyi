@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 class Model:
-    """Bodies, their collision meshes and the ground."""
+    """Bodies, cloths, their collision meshes and the ground."""
 
     def __init__(
         self,
@@ -26,9 +26,22 @@ class Model:
         ground_height: float,
         ground_margin: float,
         thickness: float,
+        cloth_names: Sequence[str],
+        cloth_margin: NDArray[np.float64],
+        cloth_poisson: NDArray[np.float64],
+        node_count: NDArray[np.int32],
+        triangle_count: NDArray[np.int32],
+        triangles: NDArray[np.int32],
+        node_rest: NDArray[np.float64],
+        warp: NDArray[np.float64],
+        pinned: NDArray[np.uint8],
     ) -> None: ...
     @property
     def body_count(self) -> int: ...
+    @property
+    def cloth_count(self) -> int: ...
+    @property
+    def node_count(self) -> int: ...
 
 class Options:
     """How steps are taken."""
@@ -41,12 +54,14 @@ class Options:
         adjoint: str = "exact",
         tolerance: float = 1e-10,
         max_iterations: int = 200,
+        coupling: str = "monolithic",
     ) -> None: ...
     dt: float
     compliance: float
     adjoint: str
     tolerance: float
     max_iterations: int
+    coupling: str
 
 class Tape:
     """What the backward of a rollout needs."""
@@ -82,13 +97,7 @@ class Rollout:
     """Trajectory, tape and statistics."""
 
     @property
-    def position(self) -> NDArray[np.float64]: ...
-    @property
-    def orientation(self) -> NDArray[np.float64]: ...
-    @property
-    def velocity(self) -> NDArray[np.float64]: ...
-    @property
-    def angular_velocity(self) -> NDArray[np.float64]: ...
+    def trajectory(self) -> tuple[NDArray[np.float64] | None, ...]: ...
     @property
     def tape(self) -> Tape | None: ...
     @property
@@ -99,17 +108,7 @@ class Rollout:
 def rollout(
     model: Model,
     options: Options,
-    position: NDArray[np.float64],
-    orientation: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    angular_velocity: NDArray[np.float64],
-    force: NDArray[np.float64] | None,
-    torque: NDArray[np.float64] | None,
-    body_velocity: NDArray[np.float64] | None,
-    body_angular_velocity: NDArray[np.float64] | None,
-    mass: NDArray[np.float64],
-    inertia: NDArray[np.float64],
-    gravity: NDArray[np.float64],
+    inputs: list[NDArray[np.float64] | None],
     *,
     steps: int,
     controls_have_time: bool,
@@ -119,21 +118,9 @@ def rollout(
 ) -> Rollout: ...
 def rollout_backward(
     tape: Tape,
-    position: NDArray[np.float64],
-    orientation: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    angular_velocity: NDArray[np.float64],
-    force: NDArray[np.float64] | None,
-    torque: NDArray[np.float64] | None,
-    body_velocity: NDArray[np.float64] | None,
-    body_angular_velocity: NDArray[np.float64] | None,
-    mass: NDArray[np.float64],
-    inertia: NDArray[np.float64],
-    gravity: NDArray[np.float64],
-    grad_position: NDArray[np.float64] | None,
-    grad_orientation: NDArray[np.float64] | None,
-    grad_velocity: NDArray[np.float64] | None,
-    grad_angular_velocity: NDArray[np.float64] | None,
+    inputs: list[NDArray[np.float64] | None],
+    upstream: list[NDArray[np.float64] | None],
+    *,
     needs: Sequence[bool],
     num_threads: int,
 ) -> tuple[NDArray[np.float64] | None, ...]: ...
@@ -142,11 +129,14 @@ def separate(
     options: Options,
     position: NDArray[np.float64],
     orientation: NDArray[np.float64],
+    node_position: NDArray[np.float64],
+    *,
     mass: NDArray[np.float64],
     inertia: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]: ...
+    cloth_density: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]: ...
 def min_distance(
-    model: Model, position: NDArray[np.float64], orientation: NDArray[np.float64]
+    model: Model, position: NDArray[np.float64], orientation: NDArray[np.float64], node_position: NDArray[np.float64]
 ) -> tuple[float, int, int]: ...
 def vertex_polygon_toi(
     vertex: NDArray[np.float64],

@@ -1,6 +1,7 @@
 """Energies, momenta and frames of a state, as differentiable torch expressions, float64 inside.
 
-Mass and inertia of static and kinematic bodies are zero, so that sums over bodies are over the dynamic ones.
+Mass and inertia of static and kinematic bodies are zero, as is `node_mass` (n_nodes,) [kg] of pinned nodes, so that
+sums are over what moves freely. Without cloth `node_mass` is None.
 """
 
 from __future__ import annotations
@@ -21,24 +22,37 @@ def _spin(state: State, inertia: Tensor) -> Tensor:
     return (R @ (inertia.to(_F64) @ w_body)).squeeze(-1)
 
 
-def kinetic_energy(state: State, mass: Tensor, inertia: Tensor) -> Tensor:
+def kinetic_energy(state: State, mass: Tensor, inertia: Tensor, node_mass: Tensor | None) -> Tensor:
     velocity, w = state.velocity.to(_F64), state.angular_velocity.to(_F64)
-    twice = mass.to(_F64) * velocity.square().sum(-1) + (w * _spin(state, inertia)).sum(-1)
-    return twice.sum(-1).div(2).to(state.dtype)
+    twice = (mass.to(_F64) * velocity.square().sum(-1) + (w * _spin(state, inertia)).sum(-1)).sum(-1)
+    if node_mass is not None:
+        twice = twice + (node_mass * state.node_velocity.to(_F64).square().sum(-1)).sum(-1)
+    return twice.div(2).to(state.dtype)
 
 
-def potential_energy(state: State, mass: Tensor, gravity: Tensor) -> Tensor:
-    height = (state.position.to(_F64) * gravity.to(_F64).unsqueeze(-2)).sum(-1)
-    return -(mass.to(_F64) * height).sum(-1).to(state.dtype)
+def gravitational_energy(state: State, mass: Tensor, gravity: Tensor, node_mass: Tensor | None) -> Tensor:
+    """Float64, whatever the state is."""
+    g = gravity.to(_F64).unsqueeze(-2)
+    fallen = (mass.to(_F64) * (state.position.to(_F64) * g).sum(-1)).sum(-1)
+    if node_mass is not None:
+        fallen = fallen + (node_mass * (state.node_position.to(_F64) * g).sum(-1)).sum(-1)
+    return -fallen
 
 
-def momentum(state: State, mass: Tensor) -> Tensor:
-    return (mass.to(_F64).unsqueeze(-1) * state.velocity.to(_F64)).sum(-2).to(state.dtype)
+def momentum(state: State, mass: Tensor, node_mass: Tensor | None) -> Tensor:
+    total = (mass.to(_F64).unsqueeze(-1) * state.velocity.to(_F64)).sum(-2)
+    if node_mass is not None:
+        total = total + (node_mass.unsqueeze(-1) * state.node_velocity.to(_F64)).sum(-2)
+    return total.to(state.dtype)
 
 
-def angular_momentum(state: State, mass: Tensor, inertia: Tensor) -> Tensor:
+def angular_momentum(state: State, mass: Tensor, inertia: Tensor, node_mass: Tensor | None) -> Tensor:
     orbital: Tensor = torch.linalg.cross(state.position.to(_F64), mass.to(_F64).unsqueeze(-1) * state.velocity.to(_F64))
-    return (orbital + _spin(state, inertia)).sum(-2).to(state.dtype)
+    total = (orbital + _spin(state, inertia)).sum(-2)
+    if node_mass is not None:
+        impulse = node_mass.unsqueeze(-1) * state.node_velocity.to(_F64)
+        total = total + torch.linalg.cross(state.node_position.to(_F64), impulse).sum(-2)
+    return total.to(state.dtype)
 
 
 def _frames(R: Tensor, origin: Tensor) -> Tensor:

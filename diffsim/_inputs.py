@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -21,14 +21,15 @@ from ._check import (
 from .state import Control
 
 Controls = Control | Sequence[Control] | None
-Inputs = tuple[Tensor | None, ...]  #: of the operator: 4 of the state, 4 of the control, mass, inertia, gravity
+#: Of the operator: 6 of the state, 6 of the control, 8 parameters; those of cloth are None in a scene without.
+Inputs = tuple[Tensor | None, ...]
 
 
 def checked_inputs(
     where: str,
     state: Any,
     controls: Any,
-    parameters: tuple[Tensor, Tensor, Tensor],
+    parameters: Mapping[str, tuple[Tensor, tuple[int, ...]]],
     steps: int | None,
     body_count: int,
     node_count: int,
@@ -39,31 +40,36 @@ def checked_inputs(
         where: Who is asking, for error messages.
         state: As for `Simulator.forward`.
         controls: As for `Simulator.rollout`, or with `steps` None as for `Simulator.forward`.
-        parameters: mass, inertia, gravity.
+        parameters: In the order of the operator: name -> value and the shape it must have without a batch axis.
         steps: Of the rollout; None for a step.
         body_count: n_bodies.
         node_count: n_nodes.
     Returns: The inputs, and whether the controls among them have a time axis.
     """
     batch = check_state(where, state, body_count, node_count)
-    now = [getattr(state, name) for name in STATE_FIELDS]
+    now = [None if _unused(name, node_count) else getattr(state, name) for name in STATE_FIELDS]
     if batch is not None:
-        now = [t.expand(batch, *t.shape[-2:]) for t in now]
-    checked, batch = _parameters(where, parameters, body_count, batch)
+        now = [None if t is None else t.expand(batch, *t.shape[-2:]) for t in now]
+    checked, batch = _parameters(where, parameters, node_count, batch)
     driven: list[Tensor | None] = [None] * len(CONTROL_FIELDS)
     has_time = False
     if steps is not None:
         driven, has_time, batch = over_time(where, controls, steps, state.dtype, body_count, node_count, batch)
     elif controls is not None:
         check_control(where, controls, state.dtype, body_count, node_count, batch)
-        driven = [getattr(controls, name) for name in CONTROL_FIELDS]
+        driven = [None if _unused(name, node_count) else getattr(controls, name) for name in CONTROL_FIELDS]
     return tuple(None if t is None else t.to(torch.float64) for t in (*now, *driven, *checked)), has_time
+
+
+def _unused(name: str, node_count: int) -> bool:
+    """Whether the scene has nothing a field speaks of."""
+    return node_count == 0 and name.startswith(("node", "cloth"))
 
 
 def over_time(
     where: str, controls: Any, steps: int, dtype: torch.dtype, body_count: int, node_count: int, batch: int | None
 ) -> tuple[list[Tensor | None], bool, int | None]:
-    """The four body controls, in the order of the core; whether they have a time axis; the batch size known now."""
+    """The controls in the order of the core; whether they have a time axis; the batch size known now."""
     if controls is None:
         return [None] * len(CONTROL_FIELDS), False, batch
     if isinstance(controls, Sequence) and not isinstance(controls, (str, bytes)):
@@ -76,7 +82,8 @@ def over_time(
             tensor = check_float_tensor(where, f"controls.{name}", value, dtype)
             shape = (node_count if name.startswith("node") else body_count, 3)
             tensor, has_time, batch = _arranged(where, f"controls.{name}", tensor, steps, shape, batch)
-            arranged[name] = tensor, has_time
+            if not _unused(name, node_count):
+                arranged[name] = tensor, has_time
     fields = [arranged[name] for name in CONTROL_FIELDS]
     if not any(has_time for _, has_time in fields):
         return [t for t, _ in fields], False, batch
@@ -123,7 +130,7 @@ def _stacked(
         batch = check_control(f"{where}: controls[{step}]", control, dtype, body_count, node_count, batch)
     stacked: list[Tensor | None] = []
     for name in CONTROL_FIELDS:
-        column = [getattr(control, name) for control in controls]
+        column = [None if _unused(name, node_count) else getattr(control, name) for control in controls]
         given = [t for t in column if t is not None]
         if len(given) not in (0, steps):
             if name.startswith("body"):  # None is not zero here, but "as it goes"
@@ -131,17 +138,21 @@ def _stacked(
                 raise ValueError(
                     f"{where}: controls[{step}].{name} is None, others are not; give it in all steps or none"
                 )
-            column = [torch.zeros(body_count, 3, dtype=dtype) if t is None else t for t in column]
+            count = node_count if name.startswith("node") else body_count
+            column = [torch.zeros(count, 3, dtype=dtype) if t is None else t for t in column]
         stacked.append(torch.stack(torch.broadcast_tensors(*column)) if given else None)
     return stacked, any(t is not None for t in stacked), batch
 
 
 def _parameters(
-    where: str, parameters: tuple[Any, Any, Any], body_count: int, batch: int | None
-) -> tuple[list[Tensor], int | None]:
-    shapes = {"mass": (body_count,), "inertia": (body_count, 3, 3), "gravity": (3,)}
-    checked = []
-    for value, (name, shape) in zip(parameters, shapes.items()):
-        checked.append(check_float_tensor(where, name, value))
-        batch = check_shape(where, name, checked[-1], shape, batch)
+    where: str, parameters: Mapping[str, tuple[Any, tuple[int, ...]]], node_count: int, batch: int | None
+) -> tuple[list[Tensor | None], int | None]:
+    checked: list[Tensor | None] = []
+    for name, (value, shape) in parameters.items():
+        if _unused(name, node_count):
+            checked.append(None)
+            continue
+        tensor = check_float_tensor(where, name, value)
+        batch = check_shape(where, name, tensor, shape, batch)
+        checked.append(tensor)
     return checked, batch

@@ -1,12 +1,12 @@
-"""Do bodies overlap at the start, and how deep? Run once per scene, before anything moves.
+"""Do objects overlap at the start, and how deep? Run once per scene, before anything moves.
 
 Touching is fine and common (cubes stacked face to face), overlapping is not, so the two must be told apart to rounding.
 A broad phase on boxes (axis-aligned, then oriented: separated boxes, touching ones included, cost no more) leaves few
 pairs. For two meshes python-fcl then lists the triangles that meet, and for each of these pairs of triangles it is
 decided here whether they properly cross or merely touch. Points taken slightly inside one surface and tested against
-the other
-find what no crossing shows: one body wholly inside another, or bodies whose surfaces coincide. Spheres and capsules are
-points and segments with a radius and are measured exactly.
+the other find what no crossing shows: one body wholly inside another, or bodies whose surfaces coincide. Spheres and
+capsules are points and segments with a radius and are measured exactly. A cloth is an open surface: it must not cross
+anything, itself included, nor lie inside a closed body.
 """
 
 from __future__ import annotations
@@ -43,13 +43,15 @@ _MAX_FACE_PAIRS = 200_000
 
 @dataclass(frozen=True)
 class Solid:
-    """A body placed in the world: the points within `radius` of its mesh, segment or point, and what it encloses."""
+    """A body or a cloth placed in the world: the points within `radius` of its mesh, segment or point, and what it
+    encloses.
+    """
 
     vertices: FloatArray  #: world, shape (n, 3); one for a sphere, two for a capsule  [m]
     faces: IntArray  #: shape (m, 3); none for spheres and capsules
     radius: float  #: how far the surface stands off the mesh beyond the default thickness  [m]
     closed: bool  #: whether the faces enclose a volume
-    movable: bool  #: dynamic; pairs of bodies that are both not movable may overlap
+    movable: bool  #: dynamic body or cloth; pairs of bodies that are both not movable may overlap
     R_world_body: FloatArray  #: mesh axes in the world, shape (3, 3)
     box: tuple[FloatArray, FloatArray] = field(init=False)  #: world bounding box, radius included  [m]
 
@@ -115,7 +117,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Two bodies, by index, that interpenetrate; `b` may be `GROUND`."""
+    """Two solids, by index, that interpenetrate; `b` may be `GROUND`."""
 
     a: int
     b: int
@@ -127,7 +129,7 @@ def find_overlaps(solids: Sequence[Solid], ground_height: float | None, ground_r
     """All pairs that overlap by more than rounding, in the order of their indices, ground last for each body.
 
     Args:
-        solids: The bodies.
+        solids: Bodies and cloths.
         ground_height: Surface of the half-space below [m], or None.
         ground_radius: How far the ground's surface stands off that height beyond the default thickness [m].
     """
@@ -142,6 +144,52 @@ def find_overlaps(solids: Sequence[Solid], ground_height: float | None, ground_r
             if solid.movable and depth > _tolerance(solid, solid):
                 overlaps.append(Overlap(index, GROUND, depth))
     return sorted(overlaps, key=lambda overlap: (overlap.a, overlap.b == GROUND, overlap.b))
+
+
+@dataclass(frozen=True)
+class SelfCrossing:
+    """Triangles of a surface that cross."""
+
+    a: int  #: the first pair, by index
+    b: int
+    count: int  #: how many pairs
+
+
+def find_self_crossing(surface: Solid) -> SelfCrossing | None:
+    """Triangles of a surface that cross, along a piece of line longer than rounding; None if there are none.
+
+    Neighbours may be folded onto each other: of triangles that share a vertex, the edges across from it are tried
+    against the other triangle; two that share an edge cannot cross.
+    """
+    pairs = _meeting_faces(surface, surface)
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+    corners = surface.faces[pairs]
+    shared = (corners[:, 0, :, None] == corners[:, 1, None, :]).sum(axis=(1, 2))
+    tolerance = _tolerance(surface, surface)
+    apart, neighbours = pairs[shared == 0], pairs[shared == 1]
+    first, second = surface.triangles[apart].transpose(1, 0, 2, 3)
+    crossing = [apart[_Crossing.of(first, second, tolerance).proper]]
+    for own, other in ((0, 1), (1, 0)):
+        mine, others = surface.faces[neighbours[:, own]], surface.faces[neighbours[:, other]]
+        free = (mine[:, :, None] != others[:, None, :]).all(axis=2)  # two corners of each
+        start, end = surface.vertices[mine[free].reshape(-1, 2)].transpose(1, 0, 2)
+        crossing.append(neighbours[_pierces(start, end, surface.vertices[others], tolerance)])
+    found = np.unique(np.concatenate(crossing), axis=0)
+    return SelfCrossing(int(found[0, 0]), int(found[0, 1]), len(found)) if len(found) else None
+
+
+def _pierces(start: FloatArray, end: FloatArray, triangles: FloatArray, tolerance: float) -> NDArray[np.bool_]:
+    """Whether segments (k, 3) pass through the inside of triangles (k, 3, 3), further from its edges than rounding."""
+    normal = _unit_normals(triangles)
+    h0 = np.einsum("ki,ki->k", start - triangles[:, 0], normal)
+    h1 = np.einsum("ki,ki->k", end - triangles[:, 0], normal)
+    through = (np.minimum(np.abs(h0), np.abs(h1)) > tolerance) & ((h0 > 0.0) != (h1 > 0.0))
+    point = start + np.where(through, h0 / np.where(through, h0 - h1, 1.0), 0.0)[:, None] * (end - start)
+    for k in range(3):
+        along = triangles[:, (k + 1) % 3] - triangles[:, k]
+        inwards = np.cross(normal, along) / np.linalg.norm(along, axis=1, keepdims=True)
+        through &= np.einsum("ki,ki->k", inwards, point - triangles[:, k]) > tolerance
+    return np.asarray(through)
 
 
 def _tolerance(a: Solid, b: Solid) -> float:
@@ -261,11 +309,18 @@ def _meeting_faces(a: Solid, b: Solid) -> NDArray[np.int64]:
     """Pairs of faces that meet, touching included, shape (k, 2)."""
     import fcl
 
-    request = fcl.CollisionRequest(num_max_contacts=_MAX_FACE_PAIRS, enable_contact=False)
-    result = fcl.CollisionResult()
-    fcl.collide(a.collision_object, b.collision_object, request, result)
+    # A surface meets itself at every triangle and its neighbours, about 13 each; no pair of it may be missed.
+    most = max(_MAX_FACE_PAIRS, 16 * len(a.faces)) if a is b else _MAX_FACE_PAIRS
+    while True:
+        request = fcl.CollisionRequest(num_max_contacts=most, enable_contact=False)
+        result = fcl.CollisionResult()
+        fcl.collide(a.collision_object, b.collision_object, request, result)
+        if a is not b or len(result.contacts) < most:
+            break
+        most *= 4
     pairs = np.array([(contact.b1, contact.b2) for contact in result.contacts], dtype=np.int64).reshape(-1, 2)
-    return np.unique(pairs, axis=0)
+    key = np.unique(pairs[:, 0] * len(b.faces) + pairs[:, 1])  # by rows takes much longer
+    return np.stack([key // len(b.faces), key % len(b.faces)], axis=1)
 
 
 def _surface_distance(a: Solid, b: Solid) -> float:

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from . import _core, _energies
 from ._check import check_instance, check_state
-from .scene import PackedScene
+from ._cloth_energy import ClothElements, elastic_energy, node_mass
+from ._packed import PackedScene
 from .state import State
 
 if TYPE_CHECKING:
@@ -26,35 +27,49 @@ class Measurements(nn.Module):
     mass: nn.Parameter
     inertia: nn.Parameter
     gravity: nn.Parameter
+    cloth_density: nn.Parameter
+    cloth_stretch: nn.Parameter
+    cloth_shear: nn.Parameter
+    cloth_bend: nn.Parameter
     _packed: PackedScene
     _model: _core.Model
     _options: _core.Options
     _body_count: int
     _node_count: int
+    _elements: ClothElements | None  #: None without cloth
 
     def kinetic_energy(self, state: State) -> Tensor:
-        """½ m v² + ½ ω·I ω over the dynamic bodies [J], shape (...); differentiable (state, `mass`, `inertia`)."""
+        """½ m v² + ½ ω·I ω over the dynamic bodies and the cloth nodes that are not pinned [J], shape (...);
+        differentiable (state, `mass`, `inertia`, `cloth_density`).
+        """
         self._check_state("kinetic_energy", state)
-        return _energies.kinetic_energy(state, self.mass, self.inertia)
+        return _energies.kinetic_energy(state, self.mass, self.inertia, self._node_mass())
 
     def potential_energy(self, state: State) -> Tensor:
-        """Σ -m g·x over the dynamic bodies [J], shape (...), without what contacts store by their compliance;
-        differentiable (state, `mass`, `gravity`).
+        """Σ -m g·x over the dynamic bodies and the cloth nodes that are not pinned, and what stretching, shearing and
+        bending cloth stored [J], shape (...); without what contacts store by their compliance. Differentiable (state,
+        `mass`, `gravity`, `cloth_density`, `cloth_stretch`, `cloth_shear`, `cloth_bend`).
         """
         self._check_state("potential_energy", state)
-        return _energies.potential_energy(state, self.mass, self.gravity)
+        energy = _energies.gravitational_energy(state, self.mass, self.gravity, self._node_mass())
+        if self._elements is not None:
+            stiffness = (t.to(torch.float64) for t in (self.cloth_stretch, self.cloth_shear, self.cloth_bend))
+            energy = energy + elastic_energy(state.node_position.to(torch.float64), self._elements, *stiffness)
+        return energy.to(state.dtype)
 
     def momentum(self, state: State) -> Tensor:
-        """Σ m v over the dynamic bodies, world frame [kg·m/s], shape (..., 3); differentiable (state, `mass`)."""
+        """Σ m v over the dynamic bodies and the cloth nodes that are not pinned, world frame [kg·m/s], shape (..., 3);
+        differentiable (state, `mass`, `cloth_density`).
+        """
         self._check_state("momentum", state)
-        return _energies.momentum(state, self.mass)
+        return _energies.momentum(state, self.mass, self._node_mass())
 
     def angular_momentum(self, state: State) -> Tensor:
-        """Σ x × m v + I ω over the dynamic bodies, about the world's origin [kg·m²/s], shape (..., 3);
-        differentiable (state, `mass`, `inertia`).
+        """Σ x × m v + I ω over the dynamic bodies and the cloth nodes that are not pinned, about the world's origin
+        [kg·m²/s], shape (..., 3); differentiable (state, `mass`, `inertia`, `cloth_density`).
         """
         self._check_state("angular_momentum", state)
-        return _energies.angular_momentum(state, self.mass, self.inertia)
+        return _energies.angular_momentum(state, self.mass, self.inertia, self._node_mass())
 
     def min_distance(self, state: State) -> float | Tensor:
         """Smallest distance between two collision surfaces (meshes offset by their margins) that can meet [m].
@@ -63,7 +78,7 @@ class Measurements(nn.Module):
             differentiable.
         """
         self._check_state("min_distance", state)
-        found = self._for_each_scene(lambda p, q: (_core.min_distance(self._model, p, q)[0],), state)[0]
+        found = self._for_each_scene(lambda *x: (_core.min_distance(self._model, *x)[0],), state)[0]
         return torch.from_numpy(found).to(state.dtype) if found.ndim else float(found)
 
     def mesh_transform(self, state: State) -> Tensor:
@@ -74,28 +89,40 @@ class Measurements(nn.Module):
         return _energies.mesh_transform(state, torch.from_numpy(self._packed.mesh_offset))
 
     def vertices(self, state: State) -> Tensor:
-        """World positions of all vertices, body after body [m], shape (..., n_vertices, 3); differentiable (state).
+        """World positions of all vertices, body after body, then cloth after cloth [m], shape (..., n_vertices, 3);
+        differentiable (state).
 
-        A sphere is one vertex, its centre; a capsule two, the ends of its axis.
+        A sphere is one vertex, its centre; a capsule two, the ends of its axis. Those of cloths are their nodes.
         """
         self._check_state("vertices", state)
         body_of_vertex = torch.from_numpy(np.repeat(np.arange(self._body_count), self._packed.vertex_count))
-        return _energies.world_vertices(state, torch.from_numpy(self._packed.vertices), body_of_vertex)
+        of_bodies = _energies.world_vertices(state, torch.from_numpy(self._packed.vertices), body_of_vertex)
+        if self._node_count == 0:
+            return of_bodies
+        nodes = state.node_position
+        leading = torch.broadcast_shapes(of_bodies.shape[:-2], nodes.shape[:-2])
+        return torch.cat([t.expand(*leading, *t.shape[-2:]) for t in (of_bodies, nodes)], dim=-2)
 
     def mesh(self, state: State, handle: SupportsIndex) -> trimesh.Trimesh:
-        """The surface of one body in the world, without its margin; spheres and capsules with facets.
+        """The surface of one object in the world, without its margin; spheres and capsules with facets.
 
         Args:
             state: Without leading axes.
-            handle: As returned by `add_body`, or the index of a body.
+            handle: As returned by `add_body` or `add_cloth`, or the index of an object, bodies first.
         """
         import trimesh
 
         self._check_state("mesh", state)
-        body = range(self._body_count)[handle]
+        p = self._packed
+        body = range(self._body_count + len(p.cloth_names))[handle]
         if state.leading_shape:
             raise ValueError(f"mesh: state must be one state, got leading axes {tuple(state.leading_shape)}; index it")
-        p = self._packed
+        if body >= self._body_count:
+            cloth = body - self._body_count
+            node, triangle = int(p.node_count[:cloth].sum()), int(p.triangle_count[:cloth].sum())
+            nodes = state.node_position[node : node + int(p.node_count[cloth])].numpy(force=True)
+            triangles = p.triangles[triangle : triangle + int(p.triangle_count[cloth])]
+            return trimesh.Trimesh(nodes, triangles, process=False)
         first_vertex, first_face = int(p.vertex_count[:body].sum()), int(p.face_count[:body].sum())
         vertices = p.vertices[first_vertex : first_vertex + int(p.vertex_count[body])]
         faces = p.faces[first_face : first_face + int(p.face_count[body])]
@@ -112,24 +139,38 @@ class Measurements(nn.Module):
         return mesh
 
     def separate(self, state: State) -> State:
-        """The state with dynamic bodies moved apart that are nearer to something than they may come to rest.
+        """The state with dynamic bodies and cloth moved apart that are nearer to something than they may come to rest.
 
         For states made by hand. Velocities stay. To autograd the shift is a constant, as if nothing moved.
 
-        Raises: ValueError for a state of the wrong shape, or one whose bodies are too deep in each other.
+        Raises: ValueError for a state of the wrong shape, or one whose objects are too deep in each other.
         """
         self._check_state("separate", state)
+
+        def changes(*placed: np.ndarray) -> tuple[np.ndarray, ...]:
+            return tuple(after - before for after, before in zip(self._separated_from(*placed), placed, strict=True))
+
+        shift, turn, node_shift = (torch.from_numpy(t).to(state.dtype) for t in self._for_each_scene(changes, state))
+        moved = state.replace(position=state.position + shift, orientation=state.orientation + turn)
+        return moved.replace(node_position=state.node_position + node_shift) if self._node_count else moved
+
+    def _separated_from(
+        self, position: np.ndarray, orientation: np.ndarray, node_position: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         p = self._packed
+        return _core.separate(
+            self._model,
+            self._options,
+            position,
+            orientation,
+            node_position,
+            mass=p.mass,
+            inertia=p.inertia,
+            cloth_density=p.cloth_density,
+        )[:3]
 
-        def separated(position: np.ndarray, orientation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            moved = _core.separate(self._model, self._options, position, orientation, p.mass, p.inertia)
-            return moved[0] - position, moved[1] - orientation
-
-        shift, turn = self._for_each_scene(separated, state)
-        return state.replace(
-            position=state.position + torch.from_numpy(shift).to(state.dtype),
-            orientation=state.orientation + torch.from_numpy(turn).to(state.dtype),
-        )
+    def _node_mass(self) -> Tensor | None:
+        return None if self._elements is None else node_mass(self._elements, self.cloth_density.to(torch.float64))
 
     def _check_state(self, where: str, state: Any) -> None:
         """As `check_state`, with any number of leading axes."""
@@ -142,9 +183,13 @@ class Measurements(nn.Module):
         check_state(where, state, self._body_count, self._node_count)
 
     def _for_each_scene(self, function: Callable[..., Any], state: State) -> tuple[np.ndarray, ...]:
-        """Stacks the results of function(position, orientation), run for every entry of the leading axes."""
-        pose = [t.numpy(force=True).astype(np.float64) for t in (state.position, state.orientation)]
-        leading = np.broadcast_shapes(*(a.shape[:-2] for a in pose))
-        position, orientation = (np.broadcast_to(a, leading + a.shape[-2:]).reshape(-1, *a.shape[-2:]) for a in pose)
-        results = [function(np.ascontiguousarray(p), np.ascontiguousarray(q)) for p, q in zip(position, orientation)]
+        """Stacks the results of function(position, orientation, node_position), run for every entry of the leading
+        axes.
+        """
+        placed = (state.position, state.orientation, state.node_position)
+        arrays = [t.numpy(force=True).astype(np.float64) for t in placed]
+        leading = np.broadcast_shapes(*(a.shape[:-2] for a in arrays))
+        scenes = int(np.prod(leading))
+        columns = [np.broadcast_to(a, leading + a.shape[-2:]).reshape(scenes, *a.shape[-2:]) for a in arrays]
+        results = [function(*(np.ascontiguousarray(a) for a in scene)) for scene in zip(*columns)]
         return tuple(np.stack(column).reshape(leading + np.shape(column[0])) for column in zip(*results))

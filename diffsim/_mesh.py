@@ -21,6 +21,8 @@ _DEGENERATE_HEIGHT = 1e-12
 # rounding.
 _FLAT_VOLUME = 1e-12
 
+_CLOSED_MEND = "remove such faces (trimesh: mesh.update_faces(mesh.nondegenerate_faces())) and close the mesh again"
+
 
 @dataclass(frozen=True)
 class EdgeDefects:
@@ -45,19 +47,53 @@ def read_mesh(mesh: Any, where: str) -> tuple[FloatArray, IntArray]:
     """
     if isinstance(mesh, (str, os.PathLike)):
         vertices, faces = _read_file(os.fspath(mesh), where)
+        # Formats such as STL repeat a vertex for every face that uses it. "+ 0.0" makes -0 and 0 the same.
+        vertices, index = np.unique(vertices + 0.0, axis=0, return_inverse=True)
+        faces = index.reshape(-1)[faces]
+        faces = faces[~_collapsed(faces)]  # that merging made into edges: they enclose nothing
     else:
-        if hasattr(mesh, "to_mesh"):
-            mesh = mesh.to_mesh()
-        if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
-            mesh = (mesh.vertices, mesh.faces)
-        if not isinstance(mesh, (tuple, list)) or len(mesh) != 2:
-            raise TypeError(
-                f"{where}: mesh must be a path, a trimesh.Trimesh or (vertices, faces), got {type(mesh).__name__}"
-            )
-        vertices, faces = _read_arrays(mesh[0], mesh[1], where)
-    _check_mesh(vertices, faces, where)
+        vertices, faces = _read_object(mesh, where)
+    _check_mesh(vertices, faces, where, _CLOSED_MEND)
     used, flat = np.unique(faces, return_inverse=True)
     return np.ascontiguousarray(vertices[used]), flat.reshape(faces.shape).astype(np.int32)
+
+
+def read_mesh_in_order(mesh: Any, where: str) -> tuple[FloatArray, IntArray]:
+    """As `read_mesh`, but vertex i stays vertex i, whether a face uses it or not.
+
+    Only where a file repeats vertices, as STL does for every face, they become one each, in the order in which the file
+    first names them.
+    """
+    if isinstance(mesh, (str, os.PathLike)):
+        vertices, faces = _read_file(os.fspath(mesh), where)
+        places, first, index = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+        if len(places) < len(vertices):
+            order = np.argsort(first)
+            rank = np.empty_like(order)
+            rank[order] = np.arange(len(order))
+            vertices, faces = places[order], rank[index.reshape(-1)][faces]
+            faces = faces[~_collapsed(faces)]
+    else:
+        vertices, faces = _read_object(mesh, where)
+    _check_mesh(vertices, faces, where, "remove such faces (trimesh: mesh.update_faces(mesh.nondegenerate_faces()))")
+    return np.array(vertices, order="C"), np.array(faces, dtype=np.int32, order="C")
+
+
+def _collapsed(faces: NDArrayInt) -> NDArray[np.bool_]:
+    """Which faces have the same vertex at two corners, shape (m,)."""
+    return np.asarray((faces == np.roll(faces, 1, axis=1)).any(axis=1))
+
+
+def _read_object(mesh: Any, where: str) -> tuple[FloatArray, NDArrayInt]:
+    if hasattr(mesh, "to_mesh"):
+        mesh = mesh.to_mesh()
+    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        mesh = (mesh.vertices, mesh.faces)
+    if not isinstance(mesh, (tuple, list)) or len(mesh) != 2:
+        raise TypeError(
+            f"{where}: mesh must be a path, a trimesh.Trimesh or (vertices, faces), got {type(mesh).__name__}"
+        )
+    return _read_arrays(mesh[0], mesh[1], where)
 
 
 def _read_file(path: str, where: str) -> tuple[FloatArray, NDArrayInt]:
@@ -65,14 +101,10 @@ def _read_file(path: str, where: str) -> tuple[FloatArray, NDArrayInt]:
         raise FileNotFoundError(f"{where}: mesh file not found: {path}")
     import trimesh  # lazily: importing diffsim must not cost what reading files costs
 
-    # process=False: trimesh would merge within an absolute 1e-8, whatever the size of the object.
-    loaded = trimesh.load_scene(path, process=False).to_mesh()
-    vertices, faces = _read_arrays(loaded.vertices, loaded.faces, where)
-    # Formats such as STL repeat a vertex for every face that uses it. "+ 0.0" makes -0 and 0 the same.
-    vertices, index = np.unique(vertices + 0.0, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[faces]
-    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)  # faces that merging made into edges enclose nothing
-    return vertices, faces[~collapsed]
+    # process=False: trimesh would merge within an absolute 1e-8, whatever the size of the object. maintain_order: it
+    # would split and sort the vertices of an OBJ file with texture coordinates.
+    loaded = trimesh.load_scene(path, process=False, maintain_order=True).to_mesh()
+    return _read_arrays(loaded.vertices, loaded.faces, where)
 
 
 def _read_arrays(vertices: Any, faces: Any, where: str) -> tuple[FloatArray, NDArrayInt]:
@@ -103,7 +135,7 @@ def to_numpy(value: Any, where: str) -> np.ndarray[Any, Any]:
         raise ValueError(f"{where}: not an array: {error}") from None
 
 
-def _check_mesh(vertices: FloatArray, faces: NDArrayInt, where: str) -> None:
+def _check_mesh(vertices: FloatArray, faces: NDArrayInt, where: str, mend: str) -> None:
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         first = int(np.argmin(finite))
@@ -118,23 +150,33 @@ def _check_mesh(vertices: FloatArray, faces: NDArrayInt, where: str) -> None:
             f"{where}: mesh face {first} is out of range: {faces[first].tolist()} with {len(vertices)} vertices "
             "(indices start at 0)"
         )
-    mend = "remove such faces (trimesh: mesh.update_faces(mesh.nondegenerate_faces())) and close the mesh again"
-    repeated = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    repeated = _collapsed(faces)
     if repeated.any():
         first = int(np.argmax(repeated))
         raise ValueError(
             f"{where}: mesh face {first} is degenerate: it repeats a vertex, {faces[first].tolist()} "
             f"({np.count_nonzero(repeated)} of {len(faces)} faces); {mend}"
         )
+    check_triangles(vertices, faces, f"{where}: mesh", mend)
+
+
+def check_triangles(
+    vertices: FloatArray,
+    faces: NDArrayInt | IntArray,
+    where: str,
+    mend: str,
+    least_height: float = _DEGENERATE_HEIGHT,
+) -> None:
+    """Refuse faces without an area worth the name: lower than `least_height` of their longest edge."""
     corners = vertices[faces]
     edges = np.roll(corners, -1, axis=1) - corners
     longest_sq = np.einsum("fki,fki->fk", edges, edges).max(axis=1)
     double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    flat = ~(double_area > _DEGENERATE_HEIGHT * longest_sq)
+    flat = ~(double_area > least_height * longest_sq)
     if flat.any():
         first = int(np.argmax(flat))
         raise ValueError(
-            f"{where}: mesh face {first} is degenerate: area {0.5 * double_area[first]:.3g} m², vertices "
+            f"{where} face {first} is degenerate: area {0.5 * double_area[first]:.3g} m², vertices "
             f"{corners[first].tolist()} ({np.count_nonzero(flat)} of {len(faces)} faces); {mend}"
         )
 

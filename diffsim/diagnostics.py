@@ -12,17 +12,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ._check import CONTROL_FIELDS, STATE_FIELDS, check_count, check_instance, check_number
+from ._check import (
+    CLOTH_PARAMETERS,
+    CONTROL_FIELDS,
+    PARAMETERS,
+    STATE_FIELDS,
+    check_count,
+    check_instance,
+    check_number,
+)
 from ._inputs import Controls, over_time
 from .simulator import Simulator
 from .state import Control, State
 
 __all__ = ["DirectionCheck", "GradcheckReport", "gradcheck"]
 
-_PARAMETERS = ("mass", "inertia", "gravity")
+# A control that has the name of a field of the state is called otherwise here.
+_CONTROL_NAMES = {name: {"node_velocity": "node_drive"}.get(name, name) for name in CONTROL_FIELDS}
 
-# Mass and inertia are moved by this many times eps, relative to their size: their effect on the motion is weaker than
-# that of the state, and rounding would be read as an error of 1e-5.
+# Parameters other than gravity are moved by this many times eps, relative to their size: their effect on the motion is
+# weaker than that of the state, and rounding would be read as an error of 1e-5.
 _PARAMETER_STEP = 100.0
 # A derivative below this fraction of the typical one is judged as if it were that large: the rest is rounding.
 _SMALL = 1e-3
@@ -124,12 +133,13 @@ def gradcheck(
         state: Where to start; copied to float64.
         controls: As for `Simulator.rollout`.
         steps: Number of steps.
-        wrt: Names of what to move: fields of the state, of the controls, or "mass", "inertia", "gravity". Default: all
-            of the state, the controls that are given, and the parameters.
+        wrt: Names of what to move: fields of the state, of the controls (`node_velocity` of the controls is called
+            "node_drive"), or parameters: "mass", "inertia", "gravity", "cloth_stretch", ... Default: all of the state,
+            the controls that are given, and the parameters.
         directions: Random directions per name.
         eps: How far to either side: of positions, velocities and quaternions (along the tangent of the unit sphere) in
-            their units; forces, torques and gravity as far as changes velocities by eps in a step; mass and inertia by
-            100 eps of their value.
+            their units; forces, torques and gravity as far as changes velocities by eps in a step; mass, inertia and
+            the parameters of cloth by 100 eps of their value.
         seed: Of the directions and of the default loss.
         loss: Final state -> scalar tensor. Default: a sum over all entries of the final state with random weights.
         median_tolerance: The largest median error with which `GradcheckReport.passed`.
@@ -149,7 +159,7 @@ def gradcheck(
         if name not in inputs:
             raise ValueError(f"{where}: wrt must hold names out of {', '.join(inputs)}, got {name!r}")
     if loss is None:
-        weights = {name: _normal(inputs[name].shape, generator) for name in STATE_FIELDS}
+        weights = {name: _normal(inputs[name].shape, generator) for name in STATE_FIELDS if name in inputs}
 
         def random_loss(final: State) -> Tensor:
             return torch.stack([(getattr(final, name) * w).sum() for name, w in weights.items()]).sum()
@@ -158,9 +168,10 @@ def gradcheck(
     module = _Rollout(sim)
 
     def run(values: dict[str, Tensor]) -> tuple[Tensor, NDArray[np.uint64]]:
-        start = state.to(torch.float64).replace(**{name: values[name] for name in STATE_FIELDS})
-        given = {name: values[name] for name in CONTROL_FIELDS if name in values}
-        parameters = {f"sim.{name}": values[name] for name in _PARAMETERS}
+        moved = {name: values[name] for name in STATE_FIELDS if name in values}
+        start = state.to(torch.float64).replace(**moved)
+        given = {field: values[name] for field, name in _CONTROL_NAMES.items() if name in values}
+        parameters = {f"sim.{name}": values[name] for name in (*PARAMETERS, *CLOTH_PARAMETERS) if name in values}
         final, signature = torch.func.functional_call(
             module, parameters, (start, Control(**given) if given else None, steps)
         )
@@ -175,7 +186,7 @@ def gradcheck(
     with torch.no_grad():
         for name, grad in zip(names, grads):
             for _ in range(directions):
-                step = eps * _direction(name, inputs, sim.dt, generator)
+                step = eps * _direction(name, inputs, sim, generator)
                 sides = [run({**inputs, name: inputs[name] + sign * step}) for sign in (1.0, -1.0)]
                 changed = any(bool((signature != base_signature).any()) for _, signature in sides)
                 difference = float(sides[0][0] - sides[1][0]) / (2 * eps)
@@ -193,16 +204,21 @@ def gradcheck(
 def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps: int) -> dict[str, Tensor]:
     """All that can be moved, in float64 and without history; controls with a time axis if they are a sequence."""
     start = state.detach().to(torch.float64)
-    inputs = {name: getattr(start, name) for name in STATE_FIELDS}
+    fields, parameters = list(STATE_FIELDS), list(PARAMETERS)
+    if sim._node_count:
+        parameters += CLOTH_PARAMETERS
+    else:
+        fields = [name for name in fields if not name.startswith("node")]
+    inputs = {name: getattr(start, name) for name in fields}
     if isinstance(controls, Control):
         given = {name: getattr(controls, name) for name in CONTROL_FIELDS}
     else:
         batch = start.leading_shape[0] if start.leading_shape else None
-        count = len(sim.body_names)
-        given = dict(zip(CONTROL_FIELDS, over_time(where, controls, steps, state.dtype, count, 0, batch)[0]))
-    inputs.update({name: t.detach().to(torch.float64) for name, t in given.items() if t is not None})
-    inputs.update({name: getattr(sim, name).detach().to(torch.float64) for name in _PARAMETERS})
-    return inputs
+        counts = len(sim.body_names), sim._node_count
+        given = dict(zip(CONTROL_FIELDS, over_time(where, controls, steps, state.dtype, *counts, batch)[0]))
+    inputs.update({_CONTROL_NAMES[k]: t.detach().to(torch.float64) for k, t in given.items() if t is not None})
+    inputs.update({name: getattr(sim, name).detach().to(torch.float64) for name in parameters})
+    return {name: t for name, t in inputs.items() if t.numel()}  # without bodies there is nothing to move of them
 
 
 def _normal(shape: torch.Size, generator: torch.Generator) -> Tensor:
@@ -213,14 +229,15 @@ def _mean_inertia(inertia: Tensor) -> Tensor:
     return inertia.diagonal(dim1=-2, dim2=-1).mean(-1)
 
 
-def _direction(name: str, inputs: dict[str, Tensor], dt: float, generator: torch.Generator) -> Tensor:
+def _direction(name: str, inputs: dict[str, Tensor], sim: Simulator, generator: torch.Generator) -> Tensor:
     """A random direction of the size that eps is multiplied with."""
+    dt = sim.dt
     value = inputs[name]
     direction = _normal(value.shape, generator)
     if name == "orientation":
         unit = torch.nn.functional.normalize(value, dim=-1)
         return direction - (direction * unit).sum(-1, keepdim=True) * unit
-    if name == "mass":
+    if name == "mass" or name in CLOTH_PARAMETERS:
         return _PARAMETER_STEP * value * direction
     if name == "inertia":
         return _PARAMETER_STEP * _mean_inertia(value)[..., None, None] * 0.5 * (direction + direction.mT)
@@ -228,6 +245,8 @@ def _direction(name: str, inputs: dict[str, Tensor], dt: float, generator: torch
         return direction / dt
     if name == "force":
         return direction * inputs["mass"].unsqueeze(-1) / dt
+    if name == "node_force" and sim._elements is not None:
+        return direction * (inputs["cloth_density"].mean() * sim._elements.node_area.mean()) / dt
     if name == "torque":
         return direction * _mean_inertia(inputs["inertia"]).unsqueeze(-1) / dt
     return direction

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +18,11 @@ __all__ = ["ConvergenceWarning", "Info", "RolloutCall", "SolverError", "rollout"
 # shortcuts are open that halve the cost of a call.
 _transforms_active = torch._C._are_functorch_transforms_active
 
-# Input axes without time and batch, in the order of the operator: state, controls, mass, inertia, gravity.
-_BASE_NDIM = (2, 2, 2, 2, 2, 2, 2, 2, 1, 3, 1)
-_CONTROLS = range(4, 8)
+# Input axes without time and batch, in the order of the operator: state, controls, then mass, inertia, gravity and
+# the five of cloth.
+_BASE_NDIM = (*(2,) * 6, *(2,) * 6, 1, 3, 1, *(1,) * 5)
+_INPUT_COUNT = len(_BASE_NDIM)
+_CONTROLS = range(6, 12)
 
 OptionalTensors = tuple[Tensor | None, ...]
 
@@ -39,8 +42,8 @@ class Info:
     failed_steps: int  #: steps of the call that did not converge, all scenes
     failure: str  #: why the first of them did not; "" if all converged
     contacts: int  #: contacts in the zones' optimizations
-    zones: int  #: independent groups of bodies in contact
-    largest_zone: int  #: bodies in the largest of them
+    zones: int  #: independent groups of bodies and cloths in contact
+    largest_zone: int  #: bodies and cloths in the largest of them
     iterations: int  #: Newton iterations of the zone that took most
     residual: float  #: KKT residual where iteration stopped, relative
     max_compression: float  #: how far the most compressed contact is below its rest distance [m]
@@ -109,19 +112,21 @@ class RolloutCall:
         self.signature: np.ndarray | None = None  # uint64 hash of the active contacts, shape (steps[, B])
 
 
-def _array(tensor: Tensor | None) -> Any:  # a float64 array or None, as the core wants it at that place
-    if tensor is None:
-        return None
+def _array(tensor: Tensor) -> Any:  # a float64 array, as the core wants it
     if not tensor.is_contiguous():
         tensor = tensor.contiguous()
     return tensor.numpy(force=True)  # force: also where it requires grad; no copy on the cpu
+
+
+def _arrays(tensors: Sequence[Tensor | None]) -> list[Any]:
+    return [None if t is None else _array(t) for t in tensors]
 
 
 def _run(call: RolloutCall, arrays: list[Any], record: bool) -> _core.Rollout:
     return _core.rollout(
         call.model,
         call.options,
-        *arrays,
+        arrays,
         steps=call.steps,
         controls_have_time=call.controls_have_time,
         keep_time=call.keep_time,
@@ -134,18 +139,13 @@ class _Rollout(torch.autograd.Function):
     # Not `once_differentiable`: that lets some second derivatives through as silent zeros. Here the backward is an
     # operator of its own (for vmap over the backward, as in jacrev), and its backward says no.
     @staticmethod
-    def forward(call: RolloutCall, *inputs: Tensor | None) -> tuple[Tensor, ...]:
-        result = _run(call, [_array(t) for t in inputs], call.record)
+    def forward(call: RolloutCall, *inputs: Tensor | None) -> OptionalTensors:
+        result = _run(call, _arrays(inputs), call.record)
         call.tape = result.tape
         call.info = result.info
         if call.want_signature:
             call.signature = result.signature
-        return (
-            torch.from_numpy(result.position),
-            torch.from_numpy(result.orientation),
-            torch.from_numpy(result.velocity),
-            torch.from_numpy(result.angular_velocity),
-        )
+        return tuple([None if a is None else torch.from_numpy(a) for a in result.trajectory])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -167,7 +167,8 @@ class _Rollout(torch.autograd.Function):
         call.record = call.record or (call.keep_tape and _any_requires_grad(folded))
         time = int(call.keep_time)
         outputs = _Rollout.apply(call, *folded)
-        return tuple(_unfold(t, info.batch_size, batch, time) for t in outputs), (time,) * 4
+        unfolded = tuple(None if t is None else _unfold(t, info.batch_size, batch, time) for t in outputs)
+        return unfolded, tuple(None if t is None else time for t in unfolded)
 
 
 class _BackwardCall:
@@ -184,12 +185,12 @@ class _RolloutBackward(torch.autograd.Function):
     @staticmethod
     def forward(backward_call: _BackwardCall, *tensors: Tensor | None) -> OptionalTensors:
         call = backward_call.call
-        arrays = [_array(t) for t in tensors]
+        arrays = _arrays(tensors)
         # Without a tape, checkpointing: the same bits again, recorded this time, and dropped after use.
-        tape = call.tape or _run(call, arrays[:11], record=True).tape
+        inputs, upstream = arrays[:_INPUT_COUNT], arrays[_INPUT_COUNT:]
+        tape = call.tape or _run(call, inputs, record=True).tape
         assert tape is not None  # it was recorded
-        needs = backward_call.needs
-        grads = _core.rollout_backward(tape, *arrays, needs=needs, num_threads=call.num_threads)  # type: ignore[misc]
+        grads = _core.rollout_backward(tape, inputs, upstream, needs=backward_call.needs, num_threads=call.num_threads)
         return tuple(None if g is None else torch.from_numpy(g) for g in grads)
 
     @staticmethod
@@ -206,7 +207,7 @@ class _RolloutBackward(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], backward_call: _BackwardCall, *tensors: Tensor | None) -> Any:
         size, dims = info.batch_size, in_dims[1:]
-        if all(dim is None for dim in dims[:11]):
+        if all(dim is None for dim in dims[:_INPUT_COUNT]):
             # One forward, many upstream gradients (jacrev, is_grads_batched): one tape, used once per gradient.
             rows = [
                 _RolloutBackward.apply(
@@ -217,8 +218,9 @@ class _RolloutBackward(torch.autograd.Function):
             outputs = tuple(None if column[0] is None else torch.stack(column) for column in zip(*rows))
             return outputs, tuple(None if t is None else 0 for t in outputs)
         call = backward_call.call
-        folded, batch = _fold_inputs(call, size, dims[:11], tensors[:11])
-        folded_grads = [_fold(t, d, size, batch, 2, int(call.keep_time)) for t, d in zip(tensors[11:], dims[11:])]
+        folded, batch = _fold_inputs(call, size, dims[:_INPUT_COUNT], tensors[:_INPUT_COUNT])
+        upstream = zip(tensors[_INPUT_COUNT:], dims[_INPUT_COUNT:])
+        folded_grads = [_fold(t, d, size, batch, 2, int(call.keep_time)) for t, d in upstream]
         grads = _RolloutBackward.apply(backward_call, *folded, *folded_grads)
         outputs = tuple(
             None if grad is None or t is None else _unfold_like(t, dim, grad, size, batch, base, time)
@@ -233,7 +235,7 @@ def _any_requires_grad(tensors: Any) -> bool:
 
 def _times(call: RolloutCall) -> list[int]:
     """How many time axes each input has."""
-    return [int(i in _CONTROLS and call.controls_have_time) for i in range(11)]
+    return [int(i in _CONTROLS and call.controls_have_time) for i in range(_INPUT_COUNT)]
 
 
 def _fold_inputs(
@@ -290,15 +292,24 @@ def rollout(
     orientation: Tensor,
     velocity: Tensor,
     angular_velocity: Tensor,
+    node_position: Tensor | None,
+    node_velocity: Tensor | None,
     force: Tensor | None,
     torque: Tensor | None,
+    node_force: Tensor | None,
     body_velocity: Tensor | None,
     body_angular_velocity: Tensor | None,
+    node_drive: Tensor | None,
     mass: Tensor,
     inertia: Tensor,
     gravity: Tensor,
-) -> tuple[Tensor, ...]:
-    """Advance all bodies by ``call.steps`` steps, each Eqs. 2 and 6 of Qiao et al. (ICML 2020) as one optimization.
+    cloth_density: Tensor | None,
+    cloth_stretch: Tensor | None,
+    cloth_shear: Tensor | None,
+    cloth_bend: Tensor | None,
+    cloth_damping: Tensor | None,
+) -> OptionalTensors:
+    """Advance everything by ``call.steps`` steps, each Eqs. 2 and 6 of Qiao et al. (ICML 2020) as one optimization.
 
     All tensors are float64 on the cpu. Any may have a batch axis of size B in front of its shape below; if one has,
     the outputs have. With ``call.controls_have_time`` every control has a time axis of length steps in front of that.
@@ -309,15 +320,24 @@ def rollout(
         orientation: Unit quaternions w, x, y, z, body to world, shape (n, 4).
         velocity: Of the centres of mass, world [m/s], shape (n, 3).
         angular_velocity: World [rad/s], shape (n, 3).
+        node_position: Of cloth, world [m], shape (n_nodes, 3). This and all else of cloth is None in a scene without.
+        node_velocity: World [m/s], shape (n_nodes, 3).
         force: At the centre of mass, world [N], shape (n, 3), or None for zero.
         torque: About the centre of mass, world [N·m], shape (n, 3), or None for zero.
+        node_force: World [N], shape (n_nodes, 3), or None for zero.
         body_velocity: Of kinematic bodies, world [m/s], shape (n, 3), or None: as in the state.
         body_angular_velocity: Of kinematic bodies, world [rad/s], shape (n, 3), or None: as in the state.
+        node_drive: Velocity of pinned nodes, world [m/s], shape (n_nodes, 3), or None for zero.
         mass: [kg], shape (n,).
         inertia: Body frame [kg·m²], shape (n, 3, 3).
         gravity: [m/s²], shape (3,).
-    Returns: position, orientation, velocity, angular_velocity after the last step, or, with ``call.keep_time``, after
-        every step with a leading time axis.
+        cloth_density: [kg/m²], shape (n_cloths,).
+        cloth_stretch: [N/m], shape (n_cloths,).
+        cloth_shear: [N/m], shape (n_cloths,).
+        cloth_bend: [N·m], shape (n_cloths,).
+        cloth_damping: [s], shape (n_cloths,).
+    Returns: position, orientation, velocity, angular_velocity, node_position, node_velocity after the last step, or,
+        with ``call.keep_time``, after every step with a leading time axis.
     Raises: ValueError for what only the core can judge: not finite, not positive, in penetration.
     Gradients: with respect to all inputs, first order only; the set of active contacts is held fixed.
     """
@@ -326,17 +346,26 @@ def rollout(
         orientation,
         velocity,
         angular_velocity,
+        node_position,
+        node_velocity,
         force,
         torque,
+        node_force,
         body_velocity,
         body_angular_velocity,
+        node_drive,
         mass,
         inertia,
         gravity,
+        cloth_density,
+        cloth_stretch,
+        cloth_shear,
+        cloth_bend,
+        cloth_damping,
     )
     if not torch.is_grad_enabled():
         call.keep_tape = False
-    outputs: tuple[Tensor, ...]
+    outputs: OptionalTensors
     if _transforms_active():
         call.record = call.keep_tape and _any_requires_grad(inputs)
         outputs = _Rollout.apply(call, *inputs)

@@ -1,4 +1,5 @@
-"""Small closed meshes, faces outwards, as `(vertices, faces)`: shape (n, 3) float64 [m] and (m, 3) int32.
+"""Small closed meshes, faces outwards, and sheets for cloth, as `(vertices, faces)`: shape (n, 3) float64 [m] and
+(m, 3) int32.
 
 For scenes, tests and first steps; anything else comes from a file or from trimesh.
 """
@@ -110,6 +111,32 @@ def torus(radius: float = 0.4, tube: float = 0.15, segments: int = 16, sides: in
     next_u, next_v = np.roll(index, -1, axis=0), np.roll(index, -1, axis=1)
     both = np.roll(next_u, -1, axis=1)
     return vertices, _split_quads(np.stack([index, next_u, both, next_v], axis=-1).reshape(-1, 4).tolist())
+
+
+def sheet(size: Sequence[float] | float = 1.0, nodes: Sequence[int] | int = 21) -> Mesh:
+    """A flat rectangle in the xy plane, centred on the origin, faces towards +z: an open mesh, for `Scene.add_cloth`.
+
+    Nodes are numbered row by row along x: with nx by ny of them, number `j * nx + i` is the i-th of the j-th row, so
+    that the corners are 0, nx - 1, nx (ny - 1) and nx ny - 1, and `range(nx)` is the edge at the smallest y. The
+    diagonals alternate like the squares of a chessboard: the sheet folds as easily along one as along the other.
+
+    Args:
+        size: Sides along x and y, or one for a square [m].
+        nodes: Numbers of nodes along x and y, or one for both; at least 2.
+    """
+    width, depth = np.broadcast_to(np.asarray(size, dtype=np.float64), 2).tolist()
+    nx, ny = np.broadcast_to(np.asarray(nodes), 2).tolist()
+    if nx != int(nx) or ny != int(ny) or min(nx, ny) < 2:
+        raise ValueError(f"sheet: nodes must be whole numbers, at least 2 along each side, got {nodes}")
+    if not (width > 0.0 and depth > 0.0):
+        raise ValueError(f"sheet: size must be positive, got {size} [m]")
+    x, y = np.linspace(-0.5 * width, 0.5 * width, int(nx)), np.linspace(-0.5 * depth, 0.5 * depth, int(ny))
+    vertices = np.stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(len(x) * len(y))], axis=1)
+    index = np.arange(len(vertices)).reshape(len(y), len(x))
+    quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1)
+    turn = np.add.outer(np.arange(len(y) - 1), np.arange(len(x) - 1)) % 2 == 1
+    quads[turn] = np.roll(quads[turn], -1, axis=-1)  # a quad is split along its first diagonal
+    return vertices, _split_quads(quads.reshape(-1, 4).tolist())
 
 
 def _split_quads(quads: Sequence[Sequence[int]]) -> NDArray[np.int32]:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from . import _core
-from ._check import check_choice, check_count, check_instance, check_number
+from ._check import CLOTH_PARAMETERS, PARAMETERS, check_choice, check_count, check_instance, check_number
+from ._cloth_energy import cloth_elements
 from ._inputs import Controls, Inputs, checked_inputs
 from ._measurements import Measurements
 from .ops import ConvergenceWarning, Info, RolloutCall, SolverError, rollout
@@ -33,6 +34,7 @@ _MENDS = {
 }
 _USUAL_MEND = "try a smaller dt or a larger max_iterations"
 
+_NOT_DRIVEN = (None,) * 6  # the controls, in the order of the operator
 _PROGRESS_UPDATES = 100  # of a rollout that is not cut into segments for checkpointing
 
 
@@ -45,8 +47,8 @@ class Simulator(Measurements):
     Physical parameters are parameters of the module, float64, with ``requires_grad=False`` until asked for, and can be
     exchanged for a call by `torch.func.functional_call`: `mass` (n_bodies,) [kg], `inertia` (n_bodies, 3, 3) in body
     axes [kg·m²], `gravity` (3,) [m/s²], `friction` and `restitution` (n_objects,), and per cloth `cloth_density`,
-    `cloth_stretch`, `cloth_shear`, `cloth_bend`, `cloth_damping` (n_cloths,). Mass and inertia of static and kinematic
-    bodies are zero and are not read.
+    `cloth_stretch`, `cloth_shear`, `cloth_bend`, `cloth_damping` (n_cloths,), in the units of `ClothMaterial`. Mass and
+    inertia of static and kinematic bodies are zero and are not read.
 
     Args:
         scene: Read now; later changes to it have no effect.
@@ -55,8 +57,8 @@ class Simulator(Measurements):
         compliance: How far contacts give way: about this part of what gravity moves a body in one step. 0: not at all,
             at the price of a few more Newton steps (the quadratic program of Eq. 6 as written).
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
-        coupling: "monolithic" or "split": whether cloth and what touches it are solved at once. Without cloth the two
-            are the same, and there is no cloth yet.
+        coupling: "monolithic" or "split": whether cloth and what touches it are solved at once, or the cloth's elastic
+            step first and its contacts after it, as the paper does. Without cloth the two are the same.
         tolerance: Relative KKT residual at which a step has converged.
         max_iterations: Newton iterations a step may take.
         num_threads: Solve that much at a time; no result depends on it. Default: `torch.get_num_threads()`.
@@ -64,7 +66,7 @@ class Simulator(Measurements):
             (`SolverError`).
         check: Whether to look for overlaps in the scene, and for parameter values this version does not know. Types and
             shapes are always checked.
-    Raises: TypeError, ValueError for what the message names, overlapping bodies among it.
+    Raises: TypeError, ValueError for what the message names, overlapping objects among it.
     """
 
     friction: nn.Parameter
@@ -104,6 +106,7 @@ class Simulator(Measurements):
             "adjoint": adjoint,
             "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
             "max_iterations": check_count(where, "max_iterations", max_iterations),
+            "coupling": coupling,
         }
         self._num_threads = None if num_threads is None else check_count(where, "num_threads", num_threads)
         self._on_failure = on_failure
@@ -111,12 +114,9 @@ class Simulator(Measurements):
         self._packed = scene.pack(None if thickness is None else check_number(where, "thickness", thickness, above=0.0))
         if self._check:
             scene.validate(self._packed)
-        for name in ("mass", "inertia", "gravity", "friction", "restitution"):
+        for name in (*PARAMETERS, "friction", "restitution", *CLOTH_PARAMETERS):
             value = torch.from_numpy(np.array(getattr(self._packed, name), dtype=np.float64))
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
-        for name in ("density", "stretch", "shear", "bend", "damping"):
-            value = torch.zeros(0, dtype=torch.float64)
-            self.register_parameter(f"cloth_{name}", nn.Parameter(value, requires_grad=False))
         self._info: Info | list[Any] | None = None  # a list of the core's, one per segment, until someone asks
         self._warned = False
         self._build()
@@ -136,17 +136,27 @@ class Simulator(Measurements):
             ground_height=p.ground_height,
             ground_margin=p.ground_margin,
             thickness=p.thickness,
+            cloth_names=list(p.cloth_names),
+            cloth_margin=p.cloth_margin,
+            cloth_poisson=p.cloth_poisson,
+            node_count=p.node_count,
+            triangle_count=p.triangle_count,
+            triangles=p.triangles,
+            node_rest=p.node_rest,
+            warp=p.warp,
+            pinned=p.pinned,
         )
         self._options = _core.Options(**self._settings)
+        self._elements = cloth_elements(p) if p.cloth_names else None
         n = self._body_count = len(p.names)
-        self._node_count = 0
+        self._node_count = len(p.node_rest)
         self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
         self._parameter_shapes = torch.Size((n,)), torch.Size((n, 3, 3)), torch.Size((3,))
-        self._separated: tuple[np.ndarray, np.ndarray] | None = None
+        self._separated: tuple[np.ndarray, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         state = {**self.__dict__, "_info": self.info}
-        for name in ("_model", "_options"):
+        for name in ("_model", "_options", "_elements"):
             del state[name]
         return state
 
@@ -170,6 +180,11 @@ class Simulator(Measurements):
         return tuple(self._packed.names)
 
     @property
+    def cloth_names(self) -> tuple[str, ...]:
+        """Names of the cloths, in the order of the cloth axis."""
+        return tuple(self._packed.cloth_names)
+
+    @property
     def info(self) -> Info | None:
         """Statistics of the last step; None before the first."""
         if isinstance(self._info, list):
@@ -179,7 +194,7 @@ class Simulator(Measurements):
     # ---- states ------------------------------------------------------------------------------------------------------
 
     def initial_state(self, batch: int | None = None) -> State:
-        """The state the scene describes, with bodies nearer than `thickness` moved apart by at most that.
+        """The state the scene describes, with objects nearer than `thickness` moved apart by at most that.
 
         Args:
             batch: Number of copies, along a new leading axis. Default: one state without it.
@@ -187,11 +202,9 @@ class Simulator(Measurements):
         """
         p = self._packed
         if self._separated is None:
-            position, orientation, _ = _core.separate(
-                self._model, self._options, p.position, p.orientation, p.mass, p.inertia
-            )
-            self._separated = position, orientation
-        arrays = (*self._separated, p.velocity, p.angular_velocity)
+            self._separated = self._separated_from(p.position, p.orientation, p.node_position)
+        position, orientation, node_position = self._separated
+        arrays = position, orientation, p.velocity, p.angular_velocity, node_position, p.node_velocity
         tensors = [torch.from_numpy(a).to(self.mass.dtype) for a in arrays]
         if batch is not None:
             count = check_count("initial_state", "batch", batch)
@@ -201,17 +214,18 @@ class Simulator(Measurements):
     # ---- stepping ----------------------------------------------------------------------------------------------------
 
     def forward(self, state: State, control: Control | None = None) -> State:
-        """One time step; differentiable with respect to the state, the control, `mass`, `inertia` and `gravity`.
+        """One time step; differentiable with respect to the state, the control, `mass`, `inertia`, `gravity` and the
+        parameters of cloth.
 
         Args:
             state: Of one dtype, float32 or float64, with or without a batch axis (of size B) in front of any tensor.
-            control: Of the state's dtype, each tensor with or without a batch axis. Default: no forces, and kinematic
-                bodies go on as they move.
+            control: Of the state's dtype, each tensor with or without a batch axis. Default: no forces, kinematic
+                bodies go on as they move, and pinned nodes stand still.
         Returns: The state one `dt` later, in the state's dtype; with a batch axis if any input has one.
         Raises:
             TypeError, ValueError: Wrong type, dtype, device or shape; values that are not finite; quaternions further
-                than 1e-3 from length 1; bodies that touch, cross or are in the ground. The message
-                names object, field and value.
+                than 1e-3 from length 1; objects that touch, cross or are in the ground. The message names object, field
+                and value.
             SolverError: A step did not converge, if ``on_failure="raise"``.
         Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
         """
@@ -273,7 +287,7 @@ class Simulator(Measurements):
         if self._check:
             self._check_unused_parameters()
         threads = self._num_threads or torch.get_num_threads()
-        now, driven, parameters = inputs[:4], inputs[4:8], inputs[8:]
+        now, driven, parameters = inputs[:6], inputs[6:12], inputs[12:]
         segments, infos, signatures = [], [], []
         with _progress_bar(steps, progress) as advance:
             for start in range(0, steps, length):
@@ -293,19 +307,22 @@ class Simulator(Measurements):
                     part = tuple(None if t is None else t[start : start + count] for t in driven)
                 segment = rollout(call, *now, *part, *parameters)  # type: ignore[arg-type]
                 if start + count < steps:
-                    now = tuple(t[-1].clone() for t in segment)  # a view would keep the segment alive to the backward
+                    # A view would keep the segment alive to the backward.
+                    now = tuple(None if t is None else t[-1].clone() for t in segment)
                 segments.append(segment)
                 infos.append(call.info)
                 signatures.append(call.signature)
                 advance(count)
-        outputs = segments[0] if len(segments) == 1 else tuple(torch.cat(column) for column in zip(*segments))
+        outputs = segments[0]
+        if len(segments) > 1:
+            outputs = tuple(None if column[0] is None else torch.cat(column) for column in zip(*segments))
         result = _result(outputs, state)
         self._finish(infos, result)
         return result, np.concatenate(signatures) if want_signature else None  # type: ignore[arg-type]
 
     def _float64_inputs(self, state: Any, control: Any) -> Inputs | None:
         """The operator's tensors if nothing has to be converted or complained about; None otherwise. Kept fast."""
-        if type(state) is not State:
+        if self._node_count or type(state) is not State:
             return None
         f64 = torch.float64
         vector, quaternion, nodes = self._state_shapes
@@ -345,20 +362,24 @@ class Simulator(Measurements):
                 and state.node_velocity.shape == nodes
             ):
                 return None
-            driven: tuple[Any, ...] = (None, None, None, None)
+            driven: tuple[Any, ...] = _NOT_DRIVEN
             if control is not None:
                 if type(control) is not Control or control.node_force is not None or control.node_velocity is not None:
                     return None
-                driven = (control.force, control.torque, control.body_velocity, control.body_angular_velocity)
+                force, torque = control.force, control.torque
+                driven = (force, torque, None, control.body_velocity, control.body_angular_velocity, None)
                 for t in driven:
                     if t is not None and not (t.dtype is f64 and t.shape == vector and t.is_cpu):
                         return None
         except AttributeError:  # not a tensor
             return None
-        return position, orientation, velocity, angular_velocity, *driven, mass, inertia, gravity
+        moving = position, orientation, velocity, angular_velocity, None, None
+        return *moving, *driven, mass, inertia, gravity, None, None, None, None, None
 
     def _checked_inputs(self, where: str, state: Any, controls: Any, steps: int | None) -> tuple[Inputs, bool]:
-        parameters = self.mass, self.inertia, self.gravity
+        shapes = (*self._parameter_shapes, *(self._packed.cloth_density.shape,) * len(CLOTH_PARAMETERS))
+        names = (*PARAMETERS, *CLOTH_PARAMETERS)
+        parameters = {name: (getattr(self, name), tuple(shape)) for name, shape in zip(names, shapes, strict=True)}
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
     def _check_unused_parameters(self) -> None:
@@ -393,6 +414,9 @@ class Simulator(Measurements):
     def __repr__(self) -> str:
         runs, left_out = self._stages()
         bodies = f"{self._body_count} " + ("body" if self._body_count == 1 else "bodies")
+        if self._node_count:
+            count = len(self.cloth_names)
+            bodies += f", {count} {'cloth' if count == 1 else 'cloths'} of {self._node_count} nodes"
         settings = ", ".join(f"{name}={value!r}" for name, value in self._settings.items())
         return (
             f"{type(self).__name__}({bodies}, thickness={self.thickness:g}, {settings})\n"
@@ -412,21 +436,26 @@ class Simulator(Measurements):
         none_moves = None if dynamic else "no dynamic body"
         stage("free motion", none_moves)
         stage("kinematic motion", None if kinematic else "no kinematic body")
-        stage("ground contact", none_moves if self._packed.has_ground else "no ground")
+        nothing_moves = None if self._node_count else none_moves
+        stage("ground contact", nothing_moves if self._packed.has_ground else "no ground")
         stage("body-body contact", none_moves or (None if n > 1 else "one body"))
         stage("friction", "not in this version")
         stage("restitution", "not in this version")
-        stage("cloth", "no cloth")
+        no_cloth = None if self._node_count else "no cloth"
+        stage("cloth", no_cloth)
+        stage("cloth contact", no_cloth)
         return runs, left_out
 
 
-def _result(outputs: tuple[Tensor, ...], state: State) -> State:
-    """The operator's outputs as a state of the given state's dtype, with its (empty) cloth."""
-    position, orientation, velocity, angular_velocity = outputs
+def _result(outputs: tuple[Tensor | None, ...], state: State) -> State:
+    """The operator's outputs as a state of the given state's dtype; without cloth, with the given state's empty one."""
     if state.position.dtype is not torch.float64:
         dtype = state.position.dtype
-        position, orientation, velocity, angular_velocity = (t.to(dtype) for t in outputs)
-    node_position, node_velocity = state.node_position, state.node_velocity
+        outputs = tuple(None if t is None else t.to(dtype) for t in outputs)
+    position, orientation, velocity, angular_velocity, node_position, node_velocity = outputs
+    assert position is not None  # bodies always are, if only none of them
+    if node_position is None or node_velocity is None:
+        node_position, node_velocity = state.node_position, state.node_velocity
     if node_position.ndim != position.ndim or node_position.shape[:-2] != position.shape[:-2]:
         leading = position.shape[:-2]
         node_position = node_position.expand(*leading, *node_position.shape[-2:])

@@ -3,6 +3,8 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
+#include <algorithm>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -27,13 +29,13 @@ inline std::vector<py::ssize_t> shape_of(const py::array& array) {
     return {array.shape(), array.shape() + array.ndim()};
 }
 
-/// Throws unless the array's trailing axes are `core`.
-inline void check_core(const char* name, const Array& array, const std::vector<py::ssize_t>& core) {
-    const std::vector<py::ssize_t> shape = shape_of(array);
-    const bool fits = shape.size() >= core.size() && std::equal(core.rbegin(), core.rend(), shape.rbegin());
-    if (!fits)
+/// Throws unless the array's trailing axes are those in [begin, end).
+inline void check_core(const char* name, const Array& array, const py::ssize_t* begin, const py::ssize_t* end) {
+    const py::ssize_t extra = array.ndim() - (end - begin);
+    if (extra < 0 || !std::equal(begin, end, array.shape() + extra))
         throw std::invalid_argument(
-            std::string(name) + " must have trailing shape " + shape_text(core) + ", got " + shape_text(shape));
+            std::string(name) + " must have trailing shape " + shape_text({begin, end}) + ", got " +
+            shape_text(shape_of(array)));
 }
 
 }  // namespace diffsim::bindings

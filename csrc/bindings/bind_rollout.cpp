@@ -1,7 +1,11 @@
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <array>
 #include <cstring>
+#include <functional>
+#include <initializer_list>
+#include <numeric>
 #include <stdexcept>
 
 #include "bindings/arrays.hpp"
@@ -13,39 +17,85 @@ namespace {
 
 using Shape = std::vector<py::ssize_t>;
 
-/// One input's name, core shape and rank among the leading axes it may have.
-struct Field {
-    const char* name;
-    Shape core;
-    bool is_control;
+constexpr std::size_t kInputCount = 20, kOutputCount = 6;
+using InputArrays = std::array<OptionalArray, kInputCount>;    // in the order of RolloutArrays
+using OutputArrays = std::array<OptionalArray, kOutputCount>;  // in the order of TrajectoryArrays
+
+/// The axes of an array behind time and batch. Without a heap: a call makes some twenty of them.
+struct Core {
+    std::array<py::ssize_t, 3> axes{};
+    py::ssize_t rank = 0;
+
+    Core(std::initializer_list<py::ssize_t> list) : rank(static_cast<py::ssize_t>(list.size())) {
+        std::copy(list.begin(), list.end(), axes.begin());
+    }
+    const py::ssize_t* begin() const { return axes.data(); }
+    const py::ssize_t* end() const { return axes.data() + rank; }
+    py::ssize_t size() const { return std::accumulate(begin(), end(), py::ssize_t{1}, std::multiplies<py::ssize_t>()); }
 };
 
-std::array<Field, 11> input_fields(py::ssize_t n) {
+/// One input's name and core shape.
+struct Field {
+    const char* name;
+    Core core;
+    bool is_control;  ///< may have a time axis, and may be missing
+};
+using Fields = std::array<Field, kInputCount>;
+
+Fields input_fields(const Model& model) {
+    const py::ssize_t n = model.body_count(), nodes = model.node_count(), cloths = model.cloth_count();
     return {
         {{"position", {n, 3}, false},
          {"orientation", {n, 4}, false},
          {"velocity", {n, 3}, false},
          {"angular_velocity", {n, 3}, false},
+         {"node_position", {nodes, 3}, false},
+         {"node_velocity", {nodes, 3}, false},
          {"force", {n, 3}, true},
          {"torque", {n, 3}, true},
+         {"node_force", {nodes, 3}, true},
          {"body_velocity", {n, 3}, true},
          {"body_angular_velocity", {n, 3}, true},
+         {"node_drive", {nodes, 3}, true},
          {"mass", {n}, false},
          {"inertia", {n, 3, 3}, false},
-         {"gravity", {3}, false}}};
+         {"gravity", {3}, false},
+         {"cloth_density", {cloths}, false},
+         {"cloth_stretch", {cloths}, false},
+         {"cloth_shear", {cloths}, false},
+         {"cloth_bend", {cloths}, false},
+         {"cloth_damping", {cloths}, false}}};
 }
 
 template <typename T>
-std::array<BatchedView<T>*, 11> members(RolloutArrays<T>& arrays) {
-    return {&arrays.position, &arrays.orientation, &arrays.velocity,      &arrays.angular_velocity,
-            &arrays.force,    &arrays.torque,      &arrays.body_velocity, &arrays.body_angular_velocity,
-            &arrays.mass,     &arrays.inertia,     &arrays.gravity};
+std::array<BatchedView<T>*, kInputCount> members(RolloutArrays<T>& arrays) {
+    return {
+        &arrays.position,
+        &arrays.orientation,
+        &arrays.velocity,
+        &arrays.angular_velocity,
+        &arrays.node_position,
+        &arrays.node_velocity,
+        &arrays.force,
+        &arrays.torque,
+        &arrays.node_force,
+        &arrays.body_velocity,
+        &arrays.body_angular_velocity,
+        &arrays.node_drive,
+        &arrays.mass,
+        &arrays.inertia,
+        &arrays.gravity,
+        &arrays.cloth_density,
+        &arrays.cloth_stretch,
+        &arrays.cloth_shear,
+        &arrays.cloth_bend,
+        &arrays.cloth_damping};
 }
 
-py::ssize_t product(const Shape& shape) {
-    py::ssize_t result = 1;
-    for (py::ssize_t size : shape) result *= size;
-    return result;
+template <typename T>
+std::array<BatchedView<T>*, kOutputCount> members(TrajectoryArrays<T>& arrays) {
+    return {&arrays.position,         &arrays.orientation,   &arrays.velocity,
+            &arrays.angular_velocity, &arrays.node_position, &arrays.node_velocity};
 }
 
 /// The leading axes of the inputs, found in a first pass over their shapes.
@@ -56,18 +106,20 @@ struct Leading {
     py::ssize_t batch = 1;
 };
 
-Leading find_leading(
-    const std::array<OptionalArray, 11>& arrays, const std::array<Field, 11>& fields, int steps,
-    bool controls_have_time) {
+Leading find_leading(const InputArrays& arrays, const Fields& fields, int steps, bool controls_have_time) {
     Leading leading;
     leading.steps = steps;
     leading.has_time = controls_have_time;
     for (std::size_t k = 0; k < fields.size(); ++k) {
-        if (!arrays[k]) continue;
+        if (!arrays[k]) {
+            if (!fields[k].is_control && fields[k].core.axes[0] > 0)
+                throw std::invalid_argument(std::string(fields[k].name) + " must be given");
+            continue;
+        }
         const Array& array = *arrays[k];
-        check_core(fields[k].name, array, fields[k].core);
+        check_core(fields[k].name, array, fields[k].core.begin(), fields[k].core.end());
         const bool has_time = fields[k].is_control && controls_have_time;
-        const py::ssize_t extra = array.ndim() - static_cast<py::ssize_t>(fields[k].core.size());
+        const py::ssize_t extra = array.ndim() - fields[k].core.rank;
         if (extra < (has_time ? 1 : 0) || extra > (has_time ? 2 : 1))
             throw std::invalid_argument(
                 std::string(fields[k].name) + " has too few or too many leading axes, shape " +
@@ -92,14 +144,13 @@ Leading find_leading(
 template <typename T>
 BatchedView<T> view_of(T* data, const Field& field, py::ssize_t ndim, const Leading& leading) {
     const bool has_time = field.is_control && leading.has_time;
-    const py::ssize_t extra = ndim - static_cast<py::ssize_t>(field.core.size());
+    const py::ssize_t extra = ndim - field.core.rank;
     const bool has_batch = extra == (has_time ? 2 : 1);
-    const py::ssize_t size = product(field.core);
+    const py::ssize_t size = field.core.size();
     return {data, has_time ? size * (has_batch ? leading.batch : 1) : 0, has_batch ? size : 0};
 }
 
-RolloutInputs views_of(
-    const std::array<OptionalArray, 11>& arrays, const std::array<Field, 11>& fields, const Leading& leading) {
+RolloutInputs views_of(const InputArrays& arrays, const Fields& fields, const Leading& leading) {
     RolloutInputs inputs;
     const auto slots = members(inputs);
     for (std::size_t k = 0; k < fields.size(); ++k)
@@ -107,60 +158,55 @@ RolloutInputs views_of(
     return inputs;
 }
 
-/// Shape of a trajectory array whose rows have `width` numbers.
-Shape trajectory_shape(const Leading& leading, bool keep_time, py::ssize_t n, py::ssize_t width) {
+/// An output's core shape.
+Core output_core(const Model& model, std::size_t k) {
+    return {k < 4 ? model.body_count() : model.node_count(), k == 1 ? 4 : 3};
+}
+
+Shape trajectory_shape(const Leading& leading, bool keep_time, const Core& core) {
     Shape shape;
     if (keep_time) shape.push_back(leading.steps);
     if (leading.has_batch) shape.push_back(leading.batch);
-    shape.push_back(n);
-    shape.push_back(width);
+    shape.insert(shape.end(), core.begin(), core.end());
     return shape;
 }
 
 template <typename T>
-BatchedView<T> trajectory_view(T* data, const Leading& leading, bool keep_time, py::ssize_t n, py::ssize_t width) {
-    return {data, keep_time ? leading.batch * n * width : 0, leading.has_batch ? n * width : 0};
+BatchedView<T> trajectory_view(T* data, const Leading& leading, bool keep_time, const Core& core) {
+    const py::ssize_t size = core.size();
+    return {data, keep_time ? leading.batch * size : 0, leading.has_batch ? size : 0};
 }
 
 struct Rollout {
-    Array position, orientation, velocity, angular_velocity;
+    py::tuple trajectory;
     std::shared_ptr<Tape> tape;
     RolloutInfo info;
     py::array_t<std::uint64_t> signature;
 };
 
 Rollout bound_rollout(
-    const std::shared_ptr<Model>& model, const Options& options, const Array& position, const Array& orientation,
-    const Array& velocity, const Array& angular_velocity, const OptionalArray& force, const OptionalArray& torque,
-    const OptionalArray& body_velocity, const OptionalArray& body_angular_velocity, const Array& mass,
-    const Array& inertia, const Array& gravity, int steps, bool controls_have_time, bool keep_time, bool record,
-    int num_threads) {
+    const std::shared_ptr<Model>& model, const Options& options, const InputArrays& inputs, int steps,
+    bool controls_have_time, bool keep_time, bool record, int num_threads) {
     if (steps < 1) throw std::invalid_argument("steps must be at least 1");
-    const py::ssize_t n = model->body_count();
-    const std::array<OptionalArray, 11> arrays = {position, orientation, velocity,      angular_velocity,
-                                                  force,    torque,      body_velocity, body_angular_velocity,
-                                                  mass,     inertia,     gravity};
-    const std::array<Field, 11> fields = input_fields(n);
-    const Leading leading = find_leading(arrays, fields, steps, controls_have_time);
-    const RolloutInputs inputs = views_of(arrays, fields, leading);
-    Rollout result{
-        Array(trajectory_shape(leading, keep_time, n, 3)),
-        Array(trajectory_shape(leading, keep_time, n, 4)),
-        Array(trajectory_shape(leading, keep_time, n, 3)),
-        Array(trajectory_shape(leading, keep_time, n, 3)),
-        record ? std::make_shared<Tape>() : nullptr,
-        {},
-        {}};
-    const TrajectoryArrays<double> trajectory{
-        trajectory_view(result.position.mutable_data(), leading, keep_time, n, 3),
-        trajectory_view(result.orientation.mutable_data(), leading, keep_time, n, 4),
-        trajectory_view(result.velocity.mutable_data(), leading, keep_time, n, 3),
-        trajectory_view(result.angular_velocity.mutable_data(), leading, keep_time, n, 3)};
+    const Fields fields = input_fields(*model);
+    const Leading leading = find_leading(inputs, fields, steps, controls_have_time);
+    const RolloutInputs views = views_of(inputs, fields, leading);
+    Rollout result{py::tuple(kOutputCount), record ? std::make_shared<Tape>() : nullptr, {}, {}};
+    TrajectoryArrays<double> trajectory;
+    const auto slots = members(trajectory);
+    for (std::size_t k = 0; k < kOutputCount; ++k) {
+        result.trajectory[k] = py::none();
+        if (k >= 4 && model->cloths.empty()) continue;
+        const Core core = output_core(*model, k);
+        Array out(trajectory_shape(leading, keep_time, core));
+        *slots[k] = trajectory_view(out.mutable_data(), leading, keep_time, core);
+        result.trajectory[k] = std::move(out);
+    }
     const RolloutShape shape{steps, static_cast<int>(leading.batch), keep_time, controls_have_time};
     std::vector<std::uint64_t> signatures;
     {
         py::gil_scoped_release unlocked;
-        result.info = rollout(model, options, shape, inputs, trajectory, signatures, result.tape.get(), num_threads);
+        result.info = rollout(model, options, shape, views, trajectory, signatures, result.tape.get(), num_threads);
     }
     Shape signature_shape = {leading.steps};
     if (leading.has_batch) signature_shape.push_back(leading.batch);
@@ -170,61 +216,53 @@ Rollout bound_rollout(
 }
 
 py::tuple bound_backward(
-    const std::shared_ptr<Tape>& tape, const Array& position, const Array& orientation, const Array& velocity,
-    const Array& angular_velocity, const OptionalArray& force, const OptionalArray& torque,
-    const OptionalArray& body_velocity, const OptionalArray& body_angular_velocity, const Array& mass,
-    const Array& inertia, const Array& gravity, const OptionalArray& grad_position,
-    const OptionalArray& grad_orientation, const OptionalArray& grad_velocity,
-    const OptionalArray& grad_angular_velocity, const std::array<bool, 11>& needs, int num_threads) {
-    const py::ssize_t n = tape->model->body_count();
-    const std::array<OptionalArray, 11> arrays = {position, orientation, velocity,      angular_velocity,
-                                                  force,    torque,      body_velocity, body_angular_velocity,
-                                                  mass,     inertia,     gravity};
-    const std::array<Field, 11> fields = input_fields(n);
-    const Leading leading = find_leading(arrays, fields, tape->shape.steps, tape->shape.controls_have_time);
+    const std::shared_ptr<Tape>& tape, const InputArrays& inputs, const OutputArrays& upstream,
+    const std::array<bool, kInputCount>& needs, int num_threads) {
+    const Fields fields = input_fields(*tape->model);
+    const Leading leading = find_leading(inputs, fields, tape->shape.steps, tape->shape.controls_have_time);
     if (leading.batch != tape->shape.batch)
         throw std::invalid_argument("rollout_backward: inputs are not those of the forward");
-    const RolloutInputs inputs = views_of(arrays, fields, leading);
+    const RolloutInputs views = views_of(inputs, fields, leading);
     const bool keep_time = tape->shape.keep_time;
 
-    TrajectoryArrays<const double> upstream;
-    const auto read_upstream = [&](const char* name, const OptionalArray& array, py::ssize_t width,
-                                   BatchedView<const double>& view) {
-        if (!array) return;
-        const Shape expected = trajectory_shape(leading, keep_time, n, width);
-        if (shape_of(*array) != expected)
+    TrajectoryArrays<const double> upstream_views;
+    const auto upstream_slots = members(upstream_views);
+    for (std::size_t k = 0; k < kOutputCount; ++k) {
+        if (!upstream[k]) continue;
+        const Core core = output_core(*tape->model, k);
+        const Shape expected = trajectory_shape(leading, keep_time, core);
+        if (shape_of(*upstream[k]) != expected)
             throw std::invalid_argument(
-                std::string(name) + " must have shape " + shape_text(expected) + ", got " +
-                shape_text(shape_of(*array)));
-        view = trajectory_view(array->data(), leading, keep_time, n, width);
-    };
-    read_upstream("grad_position", grad_position, 3, upstream.position);
-    read_upstream("grad_orientation", grad_orientation, 4, upstream.orientation);
-    read_upstream("grad_velocity", grad_velocity, 3, upstream.velocity);
-    read_upstream("grad_angular_velocity", grad_angular_velocity, 3, upstream.angular_velocity);
+                "the gradient of output " + std::to_string(k) + " must have shape " + shape_text(expected) + ", got " +
+                shape_text(shape_of(*upstream[k])));
+        *upstream_slots[k] = trajectory_view(upstream[k]->data(), leading, keep_time, core);
+    }
 
     RolloutArrays<double> gradient;
     const auto slots = members(gradient);
     py::tuple result(fields.size());
     for (std::size_t k = 0; k < fields.size(); ++k) {
         result[k] = py::none();
-        if (!needs[k] || !arrays[k]) continue;
-        Array out(shape_of(*arrays[k]));
+        if (!needs[k] || !inputs[k]) continue;
+        Array out(shape_of(*inputs[k]));
         std::fill_n(out.mutable_data(), out.size(), 0.0);
         *slots[k] = view_of(out.mutable_data(), fields[k], out.ndim(), leading);
         result[k] = std::move(out);
     }
     {
         py::gil_scoped_release unlocked;
-        rollout_backward(*tape, inputs, upstream, gradient, num_threads);
+        rollout_backward(*tape, views, upstream_views, gradient, num_threads);
     }
     return result;
 }
 
-SceneState scene_state(const Model& model, const Array& position, const Array& orientation) {
-    const py::ssize_t n = model.body_count();
-    if (shape_of(position) != Shape{n, 3} || shape_of(orientation) != Shape{n, 4})
-        throw std::invalid_argument("position and orientation must have shapes (n_bodies, 3) and (n_bodies, 4)");
+SceneState scene_state(
+    const Model& model, const Array& position, const Array& orientation, const Array& node_position) {
+    const py::ssize_t n = model.body_count(), nodes = model.node_count();
+    if (shape_of(position) != Shape{n, 3} || shape_of(orientation) != Shape{n, 4} ||
+        shape_of(node_position) != Shape{nodes, 3})
+        throw std::invalid_argument(
+            "position, orientation and node_position must have shapes (n_bodies, 3), (n_bodies, 4) and (n_nodes, 3)");
     SceneState state;
     state.bodies.resize(model.bodies.size());
     for (py::ssize_t i = 0; i < n; ++i) {
@@ -232,35 +270,48 @@ SceneState scene_state(const Model& model, const Array& position, const Array& o
         for (int k = 0; k < 4; ++k) state.bodies[i].orientation[k] = orientation.at(i, k);
         state.bodies[i].orientation.normalize();
     }
+    for (py::ssize_t i = 0; i < nodes; ++i)
+        state.node_position.emplace_back(node_position.at(i, 0), node_position.at(i, 1), node_position.at(i, 2));
+    state.node_velocity.assign(state.node_position.size(), Vec3::Zero());
     return state;
 }
 
-py::tuple bound_min_distance(const Model& model, const Array& position, const Array& orientation) {
-    const NearestObjects nearest = nearest_objects(model, scene_state(model, position, orientation));
+py::tuple bound_min_distance(
+    const Model& model, const Array& position, const Array& orientation, const Array& node_position) {
+    const NearestObjects nearest = nearest_objects(model, scene_state(model, position, orientation, node_position));
     return py::make_tuple(nearest.distance, nearest.a, nearest.b);
 }
 
 py::tuple bound_separate(
-    const Model& model, const Options& options, const Array& position, const Array& orientation, const Array& mass,
-    const Array& inertia) {
-    const py::ssize_t n = model.body_count();
-    const SceneState state = scene_state(model, position, orientation);
-    if (shape_of(mass) != Shape{n} || shape_of(inertia) != Shape{n, 3, 3})
-        throw std::invalid_argument("mass and inertia must have shapes (n_bodies,) and (n_bodies, 3, 3)");
+    const Model& model, const Options& options, const Array& position, const Array& orientation,
+    const Array& node_position, const Array& mass, const Array& inertia, const Array& cloth_density) {
+    const py::ssize_t n = model.body_count(), nodes = model.node_count(), cloths = model.cloth_count();
+    const SceneState state = scene_state(model, position, orientation, node_position);
+    if (shape_of(mass) != Shape{n} || shape_of(inertia) != Shape{n, 3, 3} || shape_of(cloth_density) != Shape{cloths})
+        throw std::invalid_argument(
+            "mass, inertia and cloth_density must have shapes (n_bodies,), (n_bodies, 3, 3) and (n_cloths,)");
     Parameters parameters;
     for (py::ssize_t i = 0; i < n; ++i) {
         parameters.mass.push_back(mass.at(i));
         parameters.inertia.emplace_back(Eigen::Map<const Mat3>(inertia.data(i, 0, 0)));
     }
+    for (py::ssize_t i = 0; i < cloths; ++i) {
+        parameters.cloths.emplace_back();
+        parameters.cloths.back().density = cloth_density.at(i);
+    }
     const SceneState moved = separate_state(model, options, parameters, state);
-    Array new_position(Shape{n, 3}), new_orientation(Shape{n, 4});
+    Array new_position(Shape{n, 3}), new_orientation(Shape{n, 4}), new_nodes(Shape{nodes, 3});
     double max_shift = 0.0;
     for (py::ssize_t i = 0; i < n; ++i) {
         max_shift = std::max(max_shift, (moved.bodies[i].position - state.bodies[i].position).norm());
         for (int k = 0; k < 3; ++k) new_position.mutable_at(i, k) = moved.bodies[i].position[k];
         for (int k = 0; k < 4; ++k) new_orientation.mutable_at(i, k) = moved.bodies[i].orientation[k];
     }
-    return py::make_tuple(new_position, new_orientation, max_shift);
+    for (py::ssize_t i = 0; i < nodes; ++i) {
+        max_shift = std::max(max_shift, (moved.node_position[i] - state.node_position[i]).norm());
+        for (int k = 0; k < 3; ++k) new_nodes.mutable_at(i, k) = moved.node_position[i][k];
+    }
+    return py::make_tuple(new_position, new_orientation, new_nodes, max_shift);
 }
 
 /// Why a step did not converge, or nothing.
@@ -308,41 +359,30 @@ void bind_rollout(py::module_& module) {
         .def_property_readonly("milliseconds", &milliseconds);
 
     py::class_<Rollout>(module, "Rollout", "Trajectory, tape and statistics.")
-        .def_readonly("position", &Rollout::position)
-        .def_readonly("orientation", &Rollout::orientation)
-        .def_readonly("velocity", &Rollout::velocity)
-        .def_readonly("angular_velocity", &Rollout::angular_velocity)
+        .def_readonly("trajectory", &Rollout::trajectory)
         .def_readonly("tape", &Rollout::tape)
         .def_readonly("info", &Rollout::info)
         .def_readonly("signature", &Rollout::signature);
 
     module.def(
-        "rollout", &bound_rollout, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
-        py::arg("orientation").noconvert(), py::arg("velocity").noconvert(), py::arg("angular_velocity").noconvert(),
-        py::arg("force").noconvert().none(true), py::arg("torque").noconvert().none(true),
-        py::arg("body_velocity").noconvert().none(true), py::arg("body_angular_velocity").noconvert().none(true),
-        py::arg("mass").noconvert(), py::arg("inertia").noconvert(), py::arg("gravity").noconvert(), py::kw_only(),
+        "rollout", &bound_rollout, py::arg("model"), py::arg("options"), py::arg("inputs").noconvert(), py::kw_only(),
         py::arg("steps"), py::arg("controls_have_time"), py::arg("keep_time"), py::arg("record"),
         py::arg("num_threads"));
 
     module.def(
-        "rollout_backward", &bound_backward, py::arg("tape"), py::arg("position").noconvert(),
-        py::arg("orientation").noconvert(), py::arg("velocity").noconvert(), py::arg("angular_velocity").noconvert(),
-        py::arg("force").noconvert().none(true), py::arg("torque").noconvert().none(true),
-        py::arg("body_velocity").noconvert().none(true), py::arg("body_angular_velocity").noconvert().none(true),
-        py::arg("mass").noconvert(), py::arg("inertia").noconvert(), py::arg("gravity").noconvert(),
-        py::arg("grad_position").noconvert().none(true), py::arg("grad_orientation").noconvert().none(true),
-        py::arg("grad_velocity").noconvert().none(true), py::arg("grad_angular_velocity").noconvert().none(true),
-        py::arg("needs"), py::arg("num_threads"));
+        "rollout_backward", &bound_backward, py::arg("tape"), py::arg("inputs").noconvert(),
+        py::arg("upstream").noconvert(), py::kw_only(), py::arg("needs"), py::arg("num_threads"));
 
     module.def(
         "separate", &bound_separate, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
-        py::arg("orientation").noconvert(), py::arg("mass").noconvert(), py::arg("inertia").noconvert(),
-        "Move dynamic bodies apart to their rest distance: (position, orientation, largest shift [m]).");
+        py::arg("orientation").noconvert(), py::arg("node_position").noconvert(), py::kw_only(),
+        py::arg("mass").noconvert(), py::arg("inertia").noconvert(), py::arg("cloth_density").noconvert(),
+        "Move bodies and cloth apart to their rest distance: (position, orientation, node_position, largest shift "
+        "[m]).");
 
     module.def(
         "min_distance", &bound_min_distance, py::arg("model"), py::arg("position").noconvert(),
-        py::arg("orientation").noconvert());
+        py::arg("orientation").noconvert(), py::arg("node_position").noconvert());
 }
 
 }  // namespace diffsim::bindings

@@ -78,6 +78,7 @@ def test_packed_arrays_of_a_mixed_scene() -> None:
     assert (packed.has_ground, packed.ground_height, packed.ground_margin) == (True, -1.0, 0.05)
     assert packed.thickness == 0.01
     expected = {"kind": np.int32, "vertex_count": np.int32, "face_count": np.int32, "faces": np.int32}
+    expected |= {"node_count": np.int32, "triangle_count": np.int32, "triangles": np.int32, "pinned": np.uint8}
     for field in fields(packed):
         value = getattr(packed, field.name)
         if isinstance(value, np.ndarray):
@@ -441,16 +442,11 @@ def test_bad_gravity_ground_and_thickness() -> None:
             scene.pack(thickness)
 
 
-def test_cloth_is_announced_as_missing() -> None:
-    with pytest.raises(NotImplementedError, match="add_cloth: cloth is not implemented yet"):
-        Scene().add_cloth(CUBE, pinned=[0])
-
-
 def test_validate_refuses_the_arrays_of_another_scene() -> None:
     scene = scenes.falling_cubes(2)
     packed = scene.pack()
     scene.add_sphere(0.1, mass=1.0)
-    with pytest.raises(ValueError, match="another scene, or bodies have been added"):
+    with pytest.raises(ValueError, match="another scene, or objects were added"):
         scene.validate(packed)
 
 
