@@ -134,6 +134,10 @@ def separate(
     mass: NDArray[np.float64],
     inertia: NDArray[np.float64],
     cloth_density: NDArray[np.float64],
+    cloth_stretch: NDArray[np.float64],
+    cloth_shear: NDArray[np.float64],
+    cloth_bend: NDArray[np.float64],
+    cloth_damping: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]: ...
 def min_distance(
     model: Model, position: NDArray[np.float64], orientation: NDArray[np.float64], node_position: NDArray[np.float64]

@@ -167,6 +167,10 @@ class Measurements(nn.Module):
             mass=p.mass,
             inertia=p.inertia,
             cloth_density=p.cloth_density,
+            cloth_stretch=p.cloth_stretch,
+            cloth_shear=p.cloth_shear,
+            cloth_bend=p.cloth_bend,
+            cloth_damping=p.cloth_damping,
         )[:3]
 
     def _node_mass(self) -> Tensor | None:
