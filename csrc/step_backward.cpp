@@ -216,10 +216,12 @@ private:
                 adjoint.place_gradient.nodes[k] += contact.place_gradient.nodes[node];
                 const int id = model.first_node + k;
                 if (zone.nodes[k].pinned) {
-                    pinned_node(id, adjoint.place_gradient.nodes[k]);
+                    pinned_node(id, adjoint.place_gradient.nodes[k], adjoint.start_gradient[k]);
                 } else {
                     const Vec3 error = m_record.elastic_shift[id] - zone.nodes[k].target;
-                    free_node(cloth.id, k, adjoint.multiplier.nodes[k], error, 0.0, adjoint.place_gradient.nodes[k]);
+                    free_node(
+                        cloth.id, k, adjoint.multiplier.nodes[k], error, 0.0,
+                        adjoint.place_gradient.nodes[k] + adjoint.start_gradient[k]);
                 }
             }
             add_material(cloth.id, adjoint.cloth_gradient[0]);
@@ -234,11 +236,13 @@ private:
                 const int node = cloth.first_node + k;
                 const Vec3& place = adjoint.place_gradient.nodes[node];
                 if (zone.nodes[node].pinned) {
-                    pinned_node(model.first_node + k, place);
+                    pinned_node(model.first_node + k, place, adjoint.start_gradient[node]);
                     continue;
                 }
                 const Vec3 error = m_record.y.nodes[model.first_node + k] - zone.nodes[node].target;
-                free_node(cloth.id, k, adjoint.multiplier.nodes[node], error, adjoint.node_mass_gradient[node], place);
+                free_node(
+                    cloth.id, k, adjoint.multiplier.nodes[node], error, adjoint.node_mass_gradient[node],
+                    place + adjoint.start_gradient[node]);
             }
             add_material(cloth.id, adjoint.cloth_gradient[c]);
         }
@@ -268,11 +272,12 @@ private:
         m_gradient.node_velocity[node] = grad_velocity;
     }
 
-    /// A pinned node, whose motion is dt times its given velocity.
-    void pinned_node(int node, const Vec3& place) {
+    /// A pinned node, whose motion is dt times its given velocity; `start` is the gradient with respect to where it starts
+    /// while it ends where it did.
+    void pinned_node(int node, const Vec3& place, const Vec3& start) {
         const Vec3 position = m_gradient.node_position[node] + place;
         m_control_gradient.node_velocity[node] += m_gradient.node_velocity[node] + m_options.dt * position;
-        m_gradient.node_position[node] = position;
+        m_gradient.node_position[node] = position + start;
         m_gradient.node_velocity[node].setZero();
     }
 

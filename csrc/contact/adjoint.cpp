@@ -356,10 +356,12 @@ void add_elasticity(const Zone& zone, const ZonePoint& point, ZoneAdjoint& resul
         const ClothParameters& parameters = (*zone.cloth_parameters)[part.id];
         const Vec3* x = point.nodes.data() + part.first_node;
         const Vec3* z = result.multiplier.nodes.data() + part.first_node;
-        Vec3* out = result.place_gradient.nodes.data() + part.first_node;
-        add_elastic_hessian_product(zone.cloth(c), parameters, zone.dt, part.start, x, z, scale, out);
+        add_elastic_hessian_product(
+            zone.cloth(c), parameters, zone.dt, part.start, x, z, scale,
+            result.place_gradient.nodes.data() + part.first_node);
         result.cloth_gradient[static_cast<std::size_t>(c)] = add_elastic_backward(
-            zone.cloth(c), parameters, zone.dt, part.start, x, start.data() + part.first_node, z, scale, out);
+            zone.cloth(c), parameters, zone.dt, part.start, x, start.data() + part.first_node, z, scale,
+            result.start_gradient.data() + part.first_node);
     }
 }
 
@@ -404,6 +406,7 @@ ZoneAdjoint zone_adjoint(
         zone.hard ? harden(zone, point, free_upstream, solve, result.multiplier) : std::vector<double>();
 
     result.place_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
+    result.start_gradient.assign(zone.nodes.size(), Vec3::Zero());
     result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
     result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
     result.cloth_gradient.assign(zone.cloths.size(), ClothParameters{});

@@ -18,6 +18,7 @@ struct ZoneAdjoint {
     /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone, those
     /// that do not yield included, along its twist at the end of the step; one per node.
     Coordinates place_gradient;
+    std::vector<Vec3> start_gradient;             ///< one per node: through the strains that damping is measured from
     std::vector<double> mass_gradient;            ///< through the contacts' stiffness, one per dynamic body
     std::vector<double> node_mass_gradient;       ///< the same, one per node
     std::vector<ClothParameters> cloth_gradient;  ///< through elasticity, one per cloth of the zone

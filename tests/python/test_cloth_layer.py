@@ -10,7 +10,6 @@ from torch.func import functional_call, grad, jacrev, vjp, vmap
 
 import diffsim as ds
 
-pytestmark = pytest.mark.xfail(strict=True, reason="the core's step does not move cloth yet")
 
 DT = 0.01
 NODES = 16 + 9
