@@ -323,7 +323,9 @@ private:
 
 }  // namespace
 
-double allowed_step(const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts) {
+double allowed_step(
+    const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts,
+    Clearance clearance) {
     if (impacts != nullptr) impacts->clear();
     if (zone.contacts.empty()) return 1.0;
     const MotionBounds motion(zone, point, y_end);
@@ -336,7 +338,8 @@ double allowed_step(const Zone& zone, const ZonePoint& point, const Coordinates&
         // A pair that is already nearer than the floor may use up most of what is left above the pole.
         const double room = point.distances[k] - contact.range.pole;
         CcdOptions ccd;
-        const double keep = std::min(contact.range.floor - contact.range.pole, 0.1 * room);
+        const double wanted = clearance == Clearance::floor ? contact.range.floor : contact.range.landing;
+        const double keep = std::min(wanted - contact.range.pole, (clearance == Clearance::floor ? 0.1 : 0.8) * room);
         ccd.min_distance = contact.range.pole + keep;
         ccd.tolerance = 0.2 * keep;
         if (motion.approach(contact) < room - 1.2 * keep) continue;

@@ -35,8 +35,13 @@ struct Impact {
     double toi;  ///< in [0, 1] of the motion
 };
 
+/// What a motion keeps pairs above: the floor, or the distance at which impacts land, where contacts hardly push.
+enum class Clearance { floor, landing };
+
 /// How far the zone may go from an evaluated point towards y_end, vertices on straight lines, before some pair comes
-/// to its floor; at most 1. `impacts`, if given, receives the pairs that do, in the order of the contacts.
-double allowed_step(const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts);
+/// to its clearance, or nearer if it is below that already; at most 1. `impacts`, if given, receives the pairs that do, in the order of the contacts.
+double allowed_step(
+    const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts,
+    Clearance clearance = Clearance::floor);
 
 }  // namespace diffsim

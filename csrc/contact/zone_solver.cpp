@@ -128,7 +128,9 @@ private:
             if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
         if (largest_move() < kEpsilon * m_position) return;
         ensure_covered(m_w.y_end);
-        const double step = clear_step(m_w.y_end);
+        // Where cloth strikes it stops short of the contacts: near their poles, many nodes at once, Newton's method would
+        // have to climb out again.
+        const double step = m_zone.nodes.empty() ? clear_step(m_w.y_end) : clear_step(m_w.y_end, Clearance::landing);
         if (step > 0.0) accept_trial();
     }
 
@@ -141,11 +143,11 @@ private:
 
     /// Evaluate the trial at the longest allowed part of the way to y_end. A shortened arc is not on the chord that was
     /// checked, so it is checked again. 0 if no part is allowed.
-    double clear_step(const Coordinates& y_end) {
+    double clear_step(const Coordinates& y_end, Clearance clearance = Clearance::floor) {
         double step = 1.0;
         m_w.trial.y = y_end;
         for (int k = 0; k < kMaxHalvings; ++k) {
-            const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
+            const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr, clearance);
             if (allowed == 1.0 && gates_hold(m_gates, m_zone, m_w.trial.y)) {
                 evaluate(m_zone, m_w.trial);
                 if (m_w.trial.energy < kInfinity) return step;
@@ -255,6 +257,11 @@ private:
             force_sum +=
                 contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
         }
+        // The elements' forces |f| = sqrt(2 k E), by Cauchy-Schwarz Σ |f| <= sqrt(2 Σk ΣE).
+        double stiffness_sum = 0.0;
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (!m_zone.nodes[i].pinned) stiffness_sum += m_w.system.node_diagonal(i).trace();
+        force_sum += std::sqrt(2.0 * stiffness_sum * m_w.point.elastic_energy);
         return 1e-15 * std::abs(m_w.point.energy) + 8.0 * kEpsilon * m_position * force_sum;
     }
 
