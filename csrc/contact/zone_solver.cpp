@@ -18,6 +18,7 @@ constexpr int kRelaxations = 8;            // Newton steps after driven bodies w
 constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
 constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
 constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
+constexpr int kStepsBeforeExact = 3;       // with a cloth's projected Hessian, once the exact one was indefinite
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
@@ -212,11 +213,18 @@ private:
 
     /// The Newton step, from the exact Hessian where that is positive definite. False if rounding spoils even the other.
     bool newton_step() {
-        differentiate_here(Curvature::exact);
-        if (!m_w.system.factorize()) {
-            differentiate_here(Curvature::projected);
-            if (!m_w.system.factorize()) return false;
+        if (m_exact_in > 0) {
+            --m_exact_in;
+        } else {
+            differentiate_here(Curvature::exact);
+            if (m_w.system.factorize()) return solve_for_step();
+            if (!m_zone.nodes.empty()) m_exact_in = kStepsBeforeExact;
         }
+        differentiate_here(Curvature::projected);
+        return m_w.system.factorize() && solve_for_step();
+    }
+
+    bool solve_for_step() {
         m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
         for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step.bodies[i] = -m_w.derivatives.gradient.bodies[i];
         for (int i = 0; i < m_zone.node_count(); ++i) m_w.step.nodes[i] = -m_w.derivatives.gradient.nodes[i];
@@ -429,6 +437,7 @@ private:
     ContactCoverage m_coverage;
     std::vector<ImpactGate> m_gates;
     double m_position = 0.0;  // size of the numbers that distances are differences of [m]
+    int m_exact_in = 0;       // Newton steps until the exact Hessian is tried again
     bool m_rescue = false;    // some objects start the step below their floor
     ZoneResult m_result;
 };
