@@ -18,6 +18,9 @@ from ._packed import PackedScene
 # Sine of the warp's angle with a triangle's normal below which another axis takes its place, as in the core.
 _LEAST_WARP_SINE = 0.1
 
+# What a grid of squares loses of its bending stiffness by folding along their diagonals (csrc/model/cloth.hpp).
+_HINGE_RELAXATION = 1.2
+
 
 @dataclass(frozen=True)
 class ClothElements:
@@ -32,7 +35,7 @@ class ClothElements:
     triangle_cloth: Tensor  #: shape (t,)
     hinges: Tensor  #: nodes: ends of the shared edge, then the corners across from it, shape (h, 4)
     rest_angle: Tensor  #: shape (h,) [rad]
-    weight: Tensor  #: |edge|² / (sum of both areas), at rest, shape (h,)
+    weight: Tensor  #: 1.2 |edge|² / (sum of both areas), at rest, shape (h,)
     hinge_cloth: Tensor  #: shape (h,)
     poisson: Tensor  #: of each cloth, shape (c,)
 
@@ -65,7 +68,7 @@ def cloth_elements(packed: PackedScene) -> ClothElements:
         triangle_cloth=torch.from_numpy(triangle_cloth),
         hinges=torch.from_numpy(hinges),
         rest_angle=dihedral_angle(rest, torch.from_numpy(hinges)),
-        weight=torch.from_numpy(np.square(edge).sum(axis=1) / area[around].sum(axis=1)),
+        weight=torch.from_numpy(_HINGE_RELAXATION * np.square(edge).sum(axis=1) / area[around].sum(axis=1)),
         hinge_cloth=torch.from_numpy(triangle_cloth[around[:, 0]]),
         poisson=torch.from_numpy(packed.cloth_poisson),
     )

@@ -64,7 +64,7 @@ ClothHinge build_hinge(const Cloth& cloth, const std::pair<int, int>& edge, cons
     Mat34 points;
     for (int k = 0; k < 4; ++k) points.col(k) = cloth.rest[hinge.nodes[k]];
     hinge.rest_angle = dihedral_frame(points).angle;
-    hinge.weight = (points.col(1) - points.col(0)).squaredNorm() / (a.area + b.area);
+    hinge.weight = kHingeRelaxation * (points.col(1) - points.col(0)).squaredNorm() / (a.area + b.area);
     return hinge;
 }
 

@@ -97,7 +97,8 @@ def test_bending_to_a_cylinder() -> None:
         elements = cloth_elements(sim._packed)
         energy = bending_energy(dihedral_angle(rolled, elements.hinges), elements, sim.cloth_bend)
         # Half a hinge row is missing at each of the two free edges: the error is first order in the edge's length.
-        error = abs(float(energy) / (0.5 * MATERIAL.bend / radius**2 * AREA) - 1.0)
+        # Nothing folds along diagonals here: that would give back the factor 1.2.
+        error = abs(float(energy) / (1.2 * 0.5 * MATERIAL.bend / radius**2 * AREA) - 1.0)
         assert error < 0.6 * previous
         previous = error
     assert previous < 0.05
