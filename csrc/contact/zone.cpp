@@ -188,10 +188,12 @@ void add_cloth(
     }
     for (int i = 0; i < zone.node_count(); ++i) {
         const ZoneNode& node = zone.nodes[i];
-        if (node.pinned)
+        if (node.pinned) {
             gradient[i].setZero();
-        else
+        } else {
+            derivatives.largest_force = std::max(derivatives.largest_force, gradient[i].norm() / std::sqrt(node.mass));
             gradient[i] += node.mass * (point.y.nodes[i] - node.target);
+        }
         if (system == nullptr) continue;
         Mat3& block = system->node_diagonal(i);
         if (node.pinned) {

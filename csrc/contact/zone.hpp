@@ -147,7 +147,7 @@ enum class Curvature {
 struct ZoneDerivatives {
     Coordinates gradient;      ///< zero at pinned nodes
     std::vector<Vec3> torque;  ///< world-frame gradient with respect to turns, contacts only
-    double largest_force;      ///< of a single contact on a single body, in units of |L⁻¹ g|, M = L Lᵀ
+    double largest_force;      ///< of a contact on a body, of all but inertia on a node, in units of |L⁻¹ g|, M = L Lᵀ
     double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|; of a node with the cloth's own
 };
 

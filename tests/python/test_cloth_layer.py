@@ -3,13 +3,11 @@
 import copy
 import pickle
 
-import pytest
 import torch
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vjp, vmap
 
 import diffsim as ds
-
 
 DT = 0.01
 NODES = 16 + 9
