@@ -42,6 +42,27 @@ inline TriangleMesh folded_pair(double angle) {
     return {{{0, 0, 0}, {1, 0, 0}, {0.5, 1, 0}, {0.5, -std::cos(angle), -std::sin(angle)}}, {{0, 1, 2}, {1, 0, 3}}};
 }
 
+/// A cloth of this rest shape; `first_node` is left to who builds the model.
+inline Cloth cloth(const TriangleMesh& mesh, double margin = 0.0) {
+    Cloth result = build_cloth(mesh.vertices, mesh.triangles, Vec3(1.0, 0.2, 0.0));
+    result.margin = margin;
+    result.poisson = 0.2;
+    return result;
+}
+
+/// A rectangle of grid() rolled up around the y axis: turn after turn `pitch` further out from `radius`.
+inline std::vector<Vec3> rolled(const std::vector<Vec3>& sheet, double radius, double pitch) {
+    std::vector<Vec3> result;
+    for (const Vec3& x : sheet) {
+        // r = radius + c angle, and x is about radius angle + c/2 angle² along the spiral
+        const double c = pitch / (2.0 * kPi);
+        const double angle = (std::sqrt(radius * radius + 2.0 * c * x.x()) - radius) / c;
+        const double r = radius + c * angle;
+        result.emplace_back(r * std::cos(angle), x.y(), r * std::sin(angle));
+    }
+    return result;
+}
+
 inline std::vector<Vec3> moved(std::vector<Vec3> x, const Mat3& R, const Vec3& shift) {
     for (Vec3& node : x) node = R * node + shift;
     return x;
