@@ -1,8 +1,10 @@
 #include "scene_queries.hpp"
 
 #include <Eigen/LU>
+#include <algorithm>
 
 #include "contact/separation.hpp"
+#include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
@@ -54,60 +56,173 @@ SceneState separate_state(
     return result;
 }
 
+namespace {
+
+bool yields(const Model& model, int object) {
+    return object != kGround && (model.is_cloth(object) || model.bodies[object].is_dynamic());
+}
+
+Pose pose_of(const BodyState& body) { return {quaternion_to_matrix(body.orientation), body.position}; }
+
+/// An object where a state has it, relative to some origin.
+struct PlacedObject {
+    const CollisionMesh* mesh;
+    Pose pose;
+    std::vector<Vec3> nodes;  // of a cloth
+    BoxTree tree;
+
+    PlacedObject(const Model& model, const SceneState& state, int object, const Vec3& origin) {
+        if (model.is_cloth(object)) {
+            const Cloth& cloth = model.cloth_of(object);
+            mesh = &cloth.surface;
+            for (int i = 0; i < cloth.node_count(); ++i)
+                nodes.push_back(state.node_position[cloth.first_node + i] - origin);
+        } else {
+            mesh = &model.bodies[object].mesh;
+            pose = pose_of(state.bodies[object]);
+            pose.t -= origin;
+        }
+    }
+    Surface surface() const {
+        return nodes.empty() ? Surface{mesh, &pose, nullptr} : Surface{mesh, nullptr, nodes.data()};
+    }
+    /// Valid as long as this object stays where it is, until the next call.
+    SweptMesh swept(double reach) {
+        if (nodes.empty()) return {mesh, {pose, pose}, reach};
+        SweptMesh result{mesh, {}, reach, nodes.data(), nodes.data()};
+        tree = refitted_tree(result);
+        result.tree = &tree;
+        return result;
+    }
+    Box box() const {
+        if (nodes.empty()) return transformed(mesh->tree.nodes[0].box, pose);
+        Box result;
+        for (const Vec3& x : nodes) result.include(x);
+        return result;
+    }
+    /// The vertex nearest to x.
+    Vec3 nearest_vertex(const Vec3& x) const {
+        const Surface here = surface();
+        Vec3 nearest = here.vertex(mesh->active_vertices[0]);
+        for (int v : mesh->active_vertices) {
+            const Vec3 vertex = here.vertex(v);
+            if ((vertex - x).squaredNorm() < (nearest - x).squaredNorm()) nearest = vertex;
+        }
+        return nearest;
+    }
+};
+
+/// The search of nearest_objects, one pair of objects after the other.
+class NearestSearch {
+public:
+    NearestSearch(const Model& model, const SceneState& state) : m_model(model), m_state(state) {}
+
+    NearestObjects run() {
+        const int count = m_model.body_count() + m_model.cloth_count();
+        for (int a = 0; a < count; ++a) {
+            if (m_model.ground.present && yields(m_model, a)) measure_ground(a);
+            if (m_model.is_cloth(a)) measure_self(a);
+            for (int b = a + 1; b < count; ++b)
+                if (yields(m_model, a) || yields(m_model, b)) measure_pair(a, b);
+        }
+        return m_nearest;
+    }
+
+private:
+    void consider(double distance, int a, int b) {
+        if (distance < m_nearest.distance) m_nearest = {distance, a, b};
+    }
+
+    Vec3 origin_of(int object) const {
+        return m_model.is_cloth(object) ? m_state.node_position[m_model.cloth_of(object).first_node]
+                                        : m_state.bodies[object].position;
+    }
+
+    void measure_ground(int object) {
+        const PlacedObject placed(m_model, m_state, object, Vec3::Zero());
+        const Surface surface = placed.surface();
+        const double keep = m_model.ground.height + m_model.margin(object) + m_model.ground.margin;
+        for (int v : placed.mesh->active_vertices) consider(surface.vertex(v).z() - keep, object, kGround);
+    }
+
+    void measure_pair(int a, int b) {
+        const Vec3 origin = origin_of(a);
+        PlacedObject placed_a(m_model, m_state, a, origin), placed_b(m_model, m_state, b, origin);
+        const double margins = m_model.margin(a) + m_model.margin(b);
+        const Box box_a = placed_a.box(), box_b = placed_b.box();
+        const Vec3 gap = (box_a.lower - box_b.upper).cwiseMax(box_b.lower - box_a.upper).cwiseMax(0.0);
+        if (gap.norm() - margins >= m_nearest.distance) return;
+        // Two vertices near each other bound the distance from above, and so how far to look for nearer features.
+        const Vec3 vertex_b = placed_b.nearest_vertex(placed_a.nearest_vertex(box_b.center()));
+        consider((placed_a.nearest_vertex(vertex_b) - vertex_b).norm() - margins, a, b);
+        m_pairs.clear();
+        const double reach = 0.5 * (m_nearest.distance + margins);
+        collect_feature_pairs(placed_a.swept(reach), placed_b.swept(reach), m_pairs);
+        for (const FeaturePair& f : m_pairs) {
+            const Contact contact{a, b, f.type, f.feature_a, f.feature_b};
+            consider(contact_geometry(contact, placed_a.surface(), placed_b.surface(), 0.0).distance - margins, a, b);
+        }
+    }
+
+    void measure_self(int object) {
+        const Cloth& cloth = m_model.cloth_of(object);
+        PlacedObject placed(m_model, m_state, object, origin_of(object));
+        // A corner of a hinge is no further from the triangle across than from its corner.
+        const Box box = placed.box();
+        double bound = (box.upper - box.lower).norm();
+        for (const ClothHinge& hinge : cloth.hinges)
+            bound = std::min(bound, (placed.nodes[hinge.nodes[2]] - placed.nodes[hinge.nodes[3]]).norm());
+        m_pairs.clear();
+        // A little further than need be, for rounding.
+        const double reach = 0.5 * std::min(m_nearest.distance, bound) + cloth.margin + 0.01 * bound;
+        collect_self_pairs(placed.swept(reach), m_pairs);
+        for (const FeaturePair& f : m_pairs) {
+            const Contact contact{object, object, f.type, f.feature_a, f.feature_b};
+            const double distance = contact_geometry(contact, placed.surface(), placed.surface(), 0.0).distance;
+            if (distance < m_nearest.distance + 2.0 * cloth.margin)
+                consider(distance - contact_margins(m_model, contact), object, object);
+        }
+    }
+
+    const Model& m_model;
+    const SceneState& m_state;
+    NearestObjects m_nearest;
+    std::vector<FeaturePair> m_pairs;
+};
+
+}  // namespace
+
 CrossingObjects find_crossing(const Model& model, const SceneState& state) {
-    std::vector<Pose> poses;
+    const std::size_t cloth_count = model.cloths.size();
+    std::vector<SweptMesh> meshes;
+    std::vector<BoxTree> trees;
     std::vector<Box> boxes;
     for (int i = 0; i < model.body_count(); ++i) {
-        poses.push_back({quaternion_to_matrix(state.bodies[i].orientation), state.bodies[i].position});
-        boxes.push_back(transformed(model.bodies[i].mesh.tree.nodes[0].box, poses.back()));
+        const Pose pose = pose_of(state.bodies[i]);
+        meshes.push_back({&model.bodies[i].mesh, {pose, pose}, 0.0});
+        boxes.push_back(transformed(model.bodies[i].mesh.tree.nodes[0].box, pose));
     }
-    for (const auto& [a, b] : overlapping_pairs(build_box_tree(boxes))) {
-        if (!model.bodies[a].is_dynamic() && !model.bodies[b].is_dynamic()) continue;
-        if (meshes_cross(model.bodies[a].mesh, poses[a], model.bodies[b].mesh, poses[b])) return {a, b};
+    trees.reserve(cloth_count);  // meshes point into it
+    for (const Cloth& cloth : model.cloths) {
+        const Vec3* nodes = state.node_position.data() + cloth.first_node;
+        SweptMesh mesh{&cloth.surface, {}, 0.0, nodes, nodes};
+        trees.push_back(refitted_tree(mesh));
+        mesh.tree = &trees.back();
+        meshes.push_back(mesh);
+        boxes.push_back(swept_box(mesh));
+    }
+    std::vector<std::pair<int, int>> pairs = overlapping_pairs(build_box_tree(boxes));
+    for (int c = 0; c < model.cloth_count(); ++c) pairs.emplace_back(model.body_count() + c, model.body_count() + c);
+    if (cloth_count > 0) std::sort(pairs.begin(), pairs.end());
+    for (const auto& [a, b] : pairs) {
+        if (!yields(model, a) && !yields(model, b)) continue;
+        if (a == b ? crosses_itself(meshes[a]) : meshes_cross(meshes[a], meshes[b])) return {a, b};
     }
     return {};
 }
 
 NearestObjects nearest_objects(const Model& model, const SceneState& state) {
-    // Every pair of features, box trees aside: a diagnostic, not part of the step.
-    NearestObjects nearest;
-    std::vector<Pose> poses;
-    for (const BodyState& body : state.bodies) poses.push_back({quaternion_to_matrix(body.orientation), body.position});
-    const auto consider = [&](double distance, int a, int b) {
-        if (distance < nearest.distance) nearest = {distance, a, b};
-    };
-    for (int a = 0; a < model.body_count(); ++a) {
-        if (model.ground.present && model.bodies[a].kind != BodyKind::static_)
-            for (int v : model.bodies[a].mesh.active_vertices)
-                consider(
-                    (poses[a] * model.bodies[a].mesh.vertices[v]).z() - model.ground.height - model.bodies[a].margin -
-                        model.ground.margin,
-                    a, kGround);
-        for (int b = a + 1; b < model.body_count(); ++b) {
-            if (model.bodies[a].kind == BodyKind::static_ && model.bodies[b].kind == BodyKind::static_) continue;
-            const double margins = model.bodies[a].margin + model.bodies[b].margin;
-            // Boxes inflated by half of the best distance so far bound what can still improve on it.
-            const Pose origin_a{poses[a].R, poses[a].t - poses[a].t}, origin_b{poses[b].R, poses[b].t - poses[a].t};
-            const Box box_a = transformed(model.bodies[a].mesh.tree.nodes[0].box, origin_a);
-            const Box box_b = transformed(model.bodies[b].mesh.tree.nodes[0].box, origin_b);
-            const Vec3 gap = (box_a.lower - box_b.upper).cwiseMax(box_b.lower - box_a.upper).cwiseMax(0.0);
-            if (gap.norm() - margins >= nearest.distance) continue;
-            double reach = nearest.distance + margins;
-            if (reach == kInfinity)
-                reach = (poses[a].t - poses[b].t).norm() + model.bodies[a].mesh.radius + model.bodies[b].mesh.radius;
-            std::vector<FeaturePair> pairs;
-            collect_feature_pairs(
-                {&model.bodies[a].mesh, {origin_a, origin_a}, 0.5 * reach},
-                {&model.bodies[b].mesh, {origin_b, origin_b}, 0.5 * reach}, pairs);
-            for (const FeaturePair& f : pairs)
-                consider(
-                    contact_geometry(model, {a, b, f.type, f.feature_a, f.feature_b}, origin_a, origin_b, 0.0)
-                            .distance -
-                        margins,
-                    a, b);
-        }
-    }
-    return nearest;
+    return NearestSearch(model, state).run();
 }
 
 }  // namespace diffsim

@@ -566,7 +566,7 @@ std::size_t StepRecord::bytes() const {
            (start.node_position.capacity() + start.node_velocity.capacity() + y.nodes.capacity() +
             elastic_shift.capacity()) *
                sizeof(Vec3) +
-           contacts.capacity() * sizeof(Contact) +
+           contacts.capacity() * sizeof(Contact) + shifts.capacity() * sizeof(double) +
            (zone_bodies.capacity() + zone_body_end.capacity() + zone_cloths.capacity() + zone_cloth_end.capacity() +
             zone_contact_end.capacity()) *
                sizeof(int);

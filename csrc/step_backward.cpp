@@ -236,6 +236,9 @@ private:
                 const int node = cloth.first_node + k;
                 const Vec3& place = adjoint.place_gradient.nodes[node];
                 if (zone.nodes[node].pinned) {
+                    // Their motion is given, but contacts with their features are as stiff as their mass makes them.
+                    m_parameter_gradient.cloths[cloth.id].density +=
+                        adjoint.node_mass_gradient[node] * model.node_area[k];
                     pinned_node(model.first_node + k, place, adjoint.start_gradient[node]);
                     continue;
                 }

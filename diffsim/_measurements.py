@@ -72,7 +72,12 @@ class Measurements(nn.Module):
         return _energies.angular_momentum(state, self.mass, self.inertia, self._node_mass())
 
     def min_distance(self, state: State) -> float | Tensor:
-        """Smallest distance between two collision surfaces (meshes offset by their margins) that can meet [m].
+        """Smallest distance between two collision surfaces (meshes offset by their margins) that can meet [m]: of two
+        bodies, of a body or a cloth and the ground, of a cloth and another object or itself.
+
+        Of two objects at least one is a dynamic body or a cloth. Within a cloth, features that share a node do not
+        count, and of two that are nearer at rest than the cloth is thick, half their distance at rest takes the place of
+        the margins, as in contact: a sheet that lies flat reports about the size of its triangles.
 
         Returns: A float; for a state with leading axes a tensor of their shape. Infinite if nothing can meet. Not
             differentiable.

@@ -3,6 +3,8 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 
+#include "geometry/distance.hpp"
+
 namespace diffsim {
 namespace {
 
@@ -109,26 +111,25 @@ void for_each_cell_pair(const SweptMesh& a, const SweptMesh& b, const VisitCells
     TreePairing<VisitCells>{a, b, visit_cells}.visit(0, swept_box(a), 0, swept_box(b));
 }
 
-/// Pairs of features of one mesh, of cells that overlap.
-class SelfPairing {
-public:
-    SelfPairing(const SweptMesh& swept, std::vector<FeaturePair>& pairs)
-        : m_swept(swept), m_nodes(tree_of(swept).nodes), m_pairs(pairs) {}
+/// Calls visit_cells(cell_a, cell_b) for all pairs of different cells of one mesh whose swept boxes overlap.
+template <typename VisitCells>
+struct SelfPairing {
+    const SweptMesh& swept;
+    const std::vector<BoxTree::Node>& nodes;
+    const VisitCells& visit_cells;
 
     void visit(int node) {
-        const BoxTree::Node& n = m_nodes[node];
+        const BoxTree::Node& n = nodes[node];
         if (n.is_leaf()) return;  // the features of one cell share vertices
         visit(n.left);
         visit(n.right);
         visit(n.left, n.right);
     }
-
-private:
     void visit(int node_a, int node_b) {
-        const BoxTree::Node &na = m_nodes[node_a], &nb = m_nodes[node_b];
+        const BoxTree::Node &na = nodes[node_a], &nb = nodes[node_b];
         if (!na.box.overlaps(nb.box)) return;
         if (na.is_leaf() && nb.is_leaf()) {
-            pair(m_swept.mesh->cells[na.item], m_swept.mesh->cells[nb.item]);
+            visit_cells(swept.mesh->cells[na.item], swept.mesh->cells[nb.item]);
         } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
             visit(na.left, node_b);
             visit(na.right, node_b);
@@ -137,50 +138,82 @@ private:
             visit(node_a, nb.right);
         }
     }
-
-    void pair(const Cell& cell_a, const Cell& cell_b) {
-        const std::size_t first = m_pairs.size();
-        pair_cells(m_swept, cell_a, m_swept, cell_b, m_pairs);
-        const auto share = [&](const FeaturePair& pair) {
-            const CollisionMesh& mesh = *m_swept.mesh;
-            const auto in_patch = [&](int vertex, int patch) {
-                const std::vector<int>& loop = mesh.patches[patch].vertices;
-                return std::find(loop.begin(), loop.end(), vertex) != loop.end();
-            };
-            switch (pair.type) {
-                case ContactType::vertex_patch:
-                    return in_patch(pair.feature_a, pair.feature_b);
-                case ContactType::patch_vertex:
-                    return in_patch(pair.feature_b, pair.feature_a);
-                case ContactType::edge_edge:
-                    break;
-            }
-            const Edge &a = mesh.edges[pair.feature_a], &b = mesh.edges[pair.feature_b];
-            return a.p0 == b.p0 || a.p0 == b.p1 || a.p1 == b.p0 || a.p1 == b.p1;
-        };
-        m_pairs.erase(
-            std::remove_if(m_pairs.begin() + static_cast<std::ptrdiff_t>(first), m_pairs.end(), share), m_pairs.end());
-    }
-
-    const SweptMesh& m_swept;
-    const std::vector<BoxTree::Node>& m_nodes;
-    std::vector<FeaturePair>& m_pairs;
 };
 
-/// Whether a side of polygon p goes through polygon q, convex and planar, with this normal.
-bool side_crosses(const std::vector<Vec3>& p, const std::vector<Vec3>& q, const Vec3& q_normal) {
-    for (std::size_t k = 0; k < p.size(); ++k) {
-        const Vec3 &from = p[k], &to = p[(k + 1) % p.size()];
-        const double height0 = q_normal.dot(from - q[0]), height1 = q_normal.dot(to - q[0]);
+template <typename VisitCells>
+void for_each_own_cell_pair(const SweptMesh& swept, const VisitCells& visit_cells) {
+    const BoxTree& tree = tree_of(swept);
+    if (!tree.empty()) SelfPairing<VisitCells>{swept, tree.nodes, visit_cells}.visit(0);
+}
+
+bool has_vertex(const Patch& patch, int vertex) {
+    return std::find(patch.vertices.begin(), patch.vertices.end(), vertex) != patch.vertices.end();
+}
+
+/// Whether two features of one mesh have a vertex in common.
+bool share_vertex(const CollisionMesh& mesh, const FeaturePair& pair) {
+    switch (pair.type) {
+        case ContactType::vertex_patch:
+            return has_vertex(mesh.patches[pair.feature_b], pair.feature_a);
+        case ContactType::patch_vertex:
+            return has_vertex(mesh.patches[pair.feature_a], pair.feature_b);
+        case ContactType::edge_edge:
+            break;
+    }
+    const Edge &a = mesh.edges[pair.feature_a], &b = mesh.edges[pair.feature_b];
+    return a.p0 == b.p0 || a.p0 == b.p1 || a.p1 == b.p0 || a.p1 == b.p1;
+}
+
+/// A patch where its mesh's motion begins.
+struct PlacedPatch {
+    const Patch* patch = nullptr;
+    std::vector<Vec3> corners;
+    Vec3 normal;
+
+    void place(const SweptMesh& swept, int index) {
+        patch = &swept.mesh->patches[index];
+        corners.clear();
+        for (int v : patch->vertices)
+            corners.push_back(swept.begin != nullptr ? swept.begin[v] : swept.sweep.begin * swept.mesh->vertices[v]);
+        normal = swept.begin != nullptr ? polygon_normal(corners.data(), static_cast<int>(corners.size()))
+                                        : Vec3(swept.sweep.begin.R * patch->normal);
+    }
+};
+
+/// Whether a side of patch p goes through patch q, convex and planar. Of one mesh, sides that end at q do not.
+bool side_crosses(const PlacedPatch& p, const PlacedPatch& q, bool same_mesh) {
+    const std::size_t p_count = p.corners.size(), q_count = q.corners.size();
+    if (p_count < 2 || q_count < 3) return false;
+    for (std::size_t k = 0; k < p_count; ++k) {
+        const std::size_t next = (k + 1) % p_count;
+        const Vec3 &from = p.corners[k], &to = p.corners[next];
+        const double height0 = q.normal.dot(from - q.corners[0]), height1 = q.normal.dot(to - q.corners[0]);
         if (!(height0 * height1 < 0.0)) continue;
+        if (same_mesh && (has_vertex(*q.patch, p.patch->vertices[k]) || has_vertex(*q.patch, p.patch->vertices[next])))
+            continue;
         const Vec3 point = from + height0 / (height0 - height1) * (to - from);
         bool inside = true;
-        for (std::size_t l = 0; l < q.size() && inside; ++l)
-            inside = q_normal.dot((q[(l + 1) % q.size()] - q[l]).cross(point - q[l])) >= 0.0;
+        for (std::size_t l = 0; l < q_count && inside; ++l)
+            inside = q.normal.dot((q.corners[(l + 1) % q_count] - q.corners[l]).cross(point - q.corners[l])) >= 0.0;
         if (inside) return true;
     }
     return false;
 }
+
+/// Visits pairs of cells and notes whether the patches of one go through each other.
+struct CrossingCheck {
+    const SweptMesh &a, &b;
+    bool same_mesh;
+    mutable bool found = false;
+    mutable PlacedPatch p = {}, q = {};  // of which the memory is reused
+
+    void operator()(const Cell& cell_a, const Cell& cell_b) const {
+        if (found) return;
+        p.place(a, cell_a.patch);
+        q.place(b, cell_b.patch);
+        found = side_crosses(p, q, same_mesh) || side_crosses(q, p, same_mesh);
+    }
+};
 
 }  // namespace
 
@@ -205,24 +238,24 @@ void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<F
 }
 
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs) {
-    if (!tree_of(swept).empty()) SelfPairing(swept, pairs).visit(0);
+    for_each_own_cell_pair(swept, [&](const Cell& cell_a, const Cell& cell_b) {
+        const auto first = static_cast<std::ptrdiff_t>(pairs.size());
+        pair_cells(swept, cell_a, swept, cell_b, pairs);
+        const auto share = [&](const FeaturePair& pair) { return share_vertex(*swept.mesh, pair); };
+        pairs.erase(std::remove_if(pairs.begin() + first, pairs.end(), share), pairs.end());
+    });
 }
 
-bool meshes_cross(const CollisionMesh& mesh_a, const Pose& pose_a, const CollisionMesh& mesh_b, const Pose& pose_b) {
-    const auto corners = [](const CollisionMesh& mesh, const Patch& patch, const Pose& pose) {
-        std::vector<Vec3> result;
-        for (int v : patch.vertices) result.push_back(pose * mesh.vertices[v]);
-        return result;
-    };
-    bool cross = false;
-    const SweptMesh a{&mesh_a, {pose_a, pose_a}, 0.0}, b{&mesh_b, {pose_b, pose_b}, 0.0};
-    for_each_cell_pair(a, b, [&](const Cell& cell_a, const Cell& cell_b) {
-        const Patch &patch_a = mesh_a.patches[cell_a.patch], &patch_b = mesh_b.patches[cell_b.patch];
-        if (cross || patch_a.vertices.size() < 3 || patch_b.vertices.size() < 3) return;
-        const std::vector<Vec3> p = corners(mesh_a, patch_a, pose_a), q = corners(mesh_b, patch_b, pose_b);
-        cross = side_crosses(p, q, pose_b.R * patch_b.normal) || side_crosses(q, p, pose_a.R * patch_a.normal);
-    });
-    return cross;
+bool meshes_cross(const SweptMesh& a, const SweptMesh& b) {
+    const CrossingCheck check{a, b, false};
+    for_each_cell_pair(a, b, check);
+    return check.found;
+}
+
+bool crosses_itself(const SweptMesh& swept) {
+    const CrossingCheck check{swept, swept, true};
+    for_each_own_cell_pair(swept, check);
+    return check.found;
 }
 
 void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices) {

@@ -45,9 +45,12 @@ void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<F
 /// The same within one deforming mesh; features that share a vertex do not count.
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs);
 
-/// Whether the surfaces of two meshes at rest go through each other. One mesh wholly inside another does not count, nor do
-/// points and segments.
-bool meshes_cross(const CollisionMesh& mesh_a, const Pose& pose_a, const CollisionMesh& mesh_b, const Pose& pose_b);
+/// Whether the surfaces of two meshes go through each other where their motions begin: a side of a patch of one through a
+/// patch of the other. One mesh wholly inside another does not count, nor do points, nor two segments.
+bool meshes_cross(const SweptMesh& a, const SweptMesh& b);
+
+/// The same within one deforming mesh; sides and patches that share a vertex do not count.
+bool crosses_itself(const SweptMesh& swept);
 
 /// Append the vertices that come within `reach` (the mesh's own) of the half-space z <= height, at either end.
 void collect_vertices_below(const SweptMesh& swept, double height, std::vector<int>& vertices);

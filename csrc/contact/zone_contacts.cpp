@@ -66,12 +66,6 @@ double feature_mass(const Zone& zone, const ZoneContact& contact, bool of_a) {
     return mass;
 }
 
-/// Features of one cloth may be nearer at rest than its thickness: there they keep half of that.
-double self_margins(const Cloth& cloth, const Contact& contact, double margins) {
-    const Surface rest{&cloth.surface, nullptr, cloth.rest.data()};
-    return std::min(margins, 0.5 * contact_geometry(contact, rest, rest, 0.0).distance);
-}
-
 /// Let bodies that do not yield join the zone where its moving bodies come near them.
 void join_passive(
     Zone& zone, const PassiveBodies& passive, const std::vector<Box>& dynamic_boxes, Coordinates& begin,
@@ -101,6 +95,14 @@ void join_passive(
 
 }  // namespace
 
+double contact_margins(const Model& model, const Contact& contact) {
+    const double margins = model.margin(contact.object_a) + model.margin(contact.object_b);
+    if (contact.object_a != contact.object_b) return margins;
+    const Cloth& cloth = model.cloth_of(contact.object_a);
+    const Surface rest{&cloth.surface, nullptr, cloth.rest.data()};
+    return std::min(margins, 0.5 * contact_geometry(contact, rest, rest, 0.0).distance);
+}
+
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
     ZoneContact entry;
     entry.contact = contact;
@@ -109,9 +111,7 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
     entry.cloth_a = a.cloth;
     entry.cloth_b = b.cloth;
     entry.pair = -1;
-    double margins = zone.model->margin(contact.object_a) + zone.model->margin(contact.object_b);
-    if (contact.object_a == contact.object_b) margins = self_margins(zone.cloth(a.cloth), contact, margins);
-    entry.range = contact_range(margins, zone.model->thickness);
+    entry.range = contact_range(contact_margins(*zone.model, contact), zone.model->thickness);
     const double mass_a = a.cloth >= 0 ? feature_mass(zone, entry, true) : zone.bodies[a.body].mass;
     const double mass_b = b.cloth >= 0        ? feature_mass(zone, entry, false)
                           : b.body == kGround ? kInfinity

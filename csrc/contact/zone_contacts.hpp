@@ -18,6 +18,10 @@ struct ZoneObject {
     int cloth = -1;
 };
 
+/// The distance at which the two features of a contact rest: the sum of their margins. Features of one cloth may be nearer
+/// at rest than its thickness: there they keep half of that.
+double contact_margins(const Model& model, const Contact& contact);
+
 /// Append a contact between two objects of the zone with its range and stiffness; its block of the Hessian is left open.
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b);
 

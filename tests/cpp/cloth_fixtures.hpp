@@ -4,6 +4,7 @@
 #include <cmath>
 #include <vector>
 
+#include "contact/zone_contacts.hpp"
 #include "fixtures.hpp"
 #include "model/cloth.hpp"
 
@@ -42,6 +43,27 @@ inline TriangleMesh folded_pair(double angle) {
     return {{{0, 0, 0}, {1, 0, 0}, {0.5, 1, 0}, {0.5, -std::cos(angle), -std::sin(angle)}}, {{0, 1, 2}, {1, 0, 3}}};
 }
 
+/// A cloth of this rest shape; `first_node` is left to who builds the model.
+inline Cloth cloth(const TriangleMesh& mesh, double margin = 0.0) {
+    Cloth result = build_cloth(mesh.vertices, mesh.triangles, Vec3(1.0, 0.2, 0.0));
+    result.margin = margin;
+    result.poisson = 0.2;
+    return result;
+}
+
+/// A rectangle of grid() rolled up around the y axis: turn after turn `pitch` further out from `radius`.
+inline std::vector<Vec3> rolled(const std::vector<Vec3>& sheet, double radius, double pitch) {
+    std::vector<Vec3> result;
+    for (const Vec3& x : sheet) {
+        // r = radius + c angle, and x is about radius angle + c/2 angle² along the spiral
+        const double c = pitch / (2.0 * kPi);
+        const double angle = (std::sqrt(radius * radius + 2.0 * c * x.x()) - radius) / c;
+        const double r = radius + c * angle;
+        result.emplace_back(r * std::cos(angle), x.y(), r * std::sin(angle));
+    }
+    return result;
+}
+
 inline std::vector<Vec3> moved(std::vector<Vec3> x, const Mat3& R, const Vec3& shift) {
     for (Vec3& node : x) node = R * node + shift;
     return x;
@@ -50,6 +72,60 @@ inline std::vector<Vec3> moved(std::vector<Vec3> x, const Mat3& R, const Vec3& s
 inline std::vector<Vec3> shaken(std::vector<Vec3> x, check::Random& random, double size) {
     for (Vec3& node : x) node += random_vec3(random, size);
     return x;
+}
+
+/// Append a cloth of zone.model, its nodes going from `start` to start + target.
+inline void add_zone_cloth(
+    Zone& zone, int id, const std::vector<Vec3>& start, const ClothParameters& parameters,
+    const Vec3& target = Vec3::Zero()) {
+    const Cloth& cloth = zone.model->cloths[static_cast<std::size_t>(id)];
+    zone.cloths.push_back({id, zone.node_count(), elastic_start(cloth, start.data())});
+    for (std::size_t k = 0; k < start.size(); ++k) {
+        ZoneNode node;
+        node.start = start[k];
+        node.mass = parameters.density * cloth.node_area[k];
+        node.pinned = cloth.pinned[k] != 0;
+        node.target = target;
+        zone.nodes.push_back(node);
+    }
+}
+
+/// Bodies that do not yield, over boxes around the segments of their motions.
+inline PassiveBodies passive_bodies(const Model& model, std::vector<PassiveBody> bodies) {
+    PassiveBodies result;
+    result.bodies = std::move(bodies);
+    std::vector<Box> boxes;
+    for (const PassiveBody& body : result.bodies) {
+        ZoneBody driven;
+        driven.start = body.start;
+        const Body& shape = model.bodies[static_cast<std::size_t>(body.id)];
+        boxes.push_back(
+            swept_box({&shape.mesh, {body.start, pose_at(driven, body.target)}, shape.margin + shape.mesh.radius}));
+    }
+    result.tree = build_box_tree(boxes);
+    return result;
+}
+
+/// Call visit(contact) for all pairs of features of two meshes, or of one: those without a common vertex, each once.
+template <class Visit>
+void for_each_pair_of_features(
+    int object_a, const CollisionMesh& a, int object_b, const CollisionMesh& b, const Visit& visit) {
+    const bool same = object_a == object_b;
+    const auto pair = [&](ContactType type, int feature_a, int feature_b) {
+        const Contact contact{object_a, object_b, type, feature_a, feature_b};
+        if (same)
+            for (int i : feature_vertices(a, contact, true))
+                for (int j : feature_vertices(b, contact, false))
+                    if (i >= 0 && i == j) return;
+        visit(contact);
+    };
+    const auto count = [](const auto& list) { return static_cast<int>(list.size()); };
+    for (int v : a.active_vertices)
+        for (int p = 0; p < count(b.patches); ++p) pair(ContactType::vertex_patch, v, p);
+    for (int p = 0; p < count(a.patches) && !same; ++p)
+        for (int v : b.active_vertices) pair(ContactType::patch_vertex, p, v);
+    for (int i = 0; i < count(a.edges); ++i)
+        for (int j = same ? i + 1 : 0; j < count(b.edges); ++j) pair(ContactType::edge_edge, i, j);
 }
 
 inline VectorX flatten_nodes(const std::vector<Vec3>& x) {

@@ -4,12 +4,13 @@
 #include <set>
 #include <tuple>
 
-#include "fixtures.hpp"
+#include "cloth_fixtures.hpp"
 #include "geometry/distance.hpp"
 
 using namespace diffsim;
 using fixtures::random_rotation;
 using fixtures::random_vec3;
+using fixtures::TriangleMesh;
 
 namespace {
 
@@ -24,6 +25,11 @@ std::set<Key> keys(const std::vector<FeaturePair>& pairs) {
 /// Vertices at time s of a motion on straight lines.
 std::vector<Vec3> vertices_at(const SweptMesh& swept, double s) {
     std::vector<Vec3> result;
+    if (swept.begin != nullptr) {
+        for (std::size_t v = 0; v < swept.mesh->vertices.size(); ++v)
+            result.push_back((1.0 - s) * swept.begin[v] + s * swept.end[v]);
+        return result;
+    }
     for (const Vec3& x : swept.mesh->vertices)
         result.push_back((1.0 - s) * (swept.sweep.begin * x) + s * (swept.sweep.end * x));
     return result;
@@ -66,6 +72,68 @@ Sweep random_sweep(check::Random& random, double spread, double motion) {
     return {begin, {exp_rotation(random_vec3(random, motion)) * begin.R, begin.t + random_vec3(random, motion)}};
 }
 
+/// A deforming mesh in motion, with all that its SweptMesh points to.
+struct DeformingSweep {
+    const CollisionMesh* mesh;
+    std::vector<Vec3> begin, end;
+    double reach;
+    BoxTree tree = {};
+
+    SweptMesh swept() {
+        SweptMesh result{mesh, {}, reach, begin.data(), end.data()};
+        tree = refitted_tree(result);
+        result.tree = &tree;
+        return result;
+    }
+};
+
+/// A sheet rolled up, shaken, somewhere near the origin.
+DeformingSweep random_sheet(const Cloth& cloth, check::Random& random, double motion, double reach) {
+    const std::vector<Vec3> roll = fixtures::rolled(cloth.rest, 0.3, 0.15);
+    DeformingSweep result{&cloth.surface, {}, {}, reach};
+    result.begin = fixtures::moved(
+        fixtures::shaken(roll, random, 0.05), random_rotation(random), random_vec3(random, 0.4) - Vec3(0, 0.3, 0));
+    result.end = fixtures::shaken(result.begin, random, motion);
+    return result;
+}
+
+/// All pairs of features of one mesh without a common vertex and nearer than `reach` at some sampled time.
+std::set<Key> near_self_pairs(const SweptMesh& swept, double reach) {
+    std::set<Key> result;
+    const CollisionMesh& mesh = *swept.mesh;
+    for (const double s : {0.0, 0.3, 0.5, 0.8, 1.0}) {
+        const std::vector<Vec3> x = vertices_at(swept, s);
+        for (const int v : mesh.active_vertices)
+            for (int p = 0; p < static_cast<int>(mesh.patches.size()); ++p) {
+                const std::vector<int>& loop = mesh.patches[p].vertices;
+                if (std::find(loop.begin(), loop.end(), v) == loop.end() &&
+                    vertex_patch_distance(x[v], mesh, x, p) < reach)
+                    result.emplace(0, v, p);
+            }
+        for (int a = 0; a < static_cast<int>(mesh.edges.size()); ++a)
+            for (int b = a + 1; b < static_cast<int>(mesh.edges.size()); ++b) {
+                const Edge &ea = mesh.edges[a], &eb = mesh.edges[b];
+                const bool share = ea.p0 == eb.p0 || ea.p0 == eb.p1 || ea.p1 == eb.p0 || ea.p1 == eb.p1;
+                if (!share && edge_distance(ea, x, eb, x) < reach) result.emplace(2, a, b);
+            }
+    }
+    return result;
+}
+
+/// Pairs of one mesh whatever feature comes first: vertex and patch, or the smaller edge first.
+std::set<Key> self_keys(const std::vector<FeaturePair>& pairs) {
+    std::set<Key> result;
+    for (const FeaturePair& p : pairs) {
+        if (p.type == ContactType::edge_edge)
+            result.emplace(2, std::min(p.feature_a, p.feature_b), std::max(p.feature_a, p.feature_b));
+        else if (p.type == ContactType::vertex_patch)
+            result.emplace(0, p.feature_a, p.feature_b);
+        else
+            result.emplace(0, p.feature_b, p.feature_a);
+    }
+    return result;
+}
+
 CollisionMesh segment() { return build_collision_mesh({Vec3(-1, 0, 0), Vec3(1, 0, 0)}, {}); }
 CollisionMesh point() { return build_collision_mesh({Vec3::Zero()}, {}); }
 
@@ -92,6 +160,53 @@ TEST(no_pair_nearer_than_the_reach_is_missing_or_listed_twice) {
     }
     CHECK(cases_hit >= 500);
     CHECK(quiet >= 3);  // "all pairs, always" would be complete too
+}
+
+TEST(no_pair_of_a_deforming_mesh_is_missing_or_listed_twice) {
+    const CollisionMesh box = fixtures::collision_mesh(fixtures::box(Vec3(0.3, 0.2, 0.25)));
+    const Cloth first = fixtures::cloth(fixtures::grid(9, 3, 0.15)), second = fixtures::cloth(fixtures::hexagon(0.4));
+    check::Random random(11);
+    std::size_t cases_hit = 0, quiet = 0;
+    for (int k = 0; k < 30; ++k) {
+        NOTE(k);
+        const double motion = k % 3 == 0 ? 0.0 : 0.3;
+        DeformingSweep sheet = random_sheet(first, random, motion, 0.02),
+                       other = random_sheet(second, random, 0.1, 0.01);
+        const SweptMesh a{&box, random_sweep(random, 0.8, motion), 0.01}, b = sheet.swept(), c = other.swept();
+        for (const auto& [one, two] : {std::pair(a, b), std::pair(b, a), std::pair(b, c), std::pair(a, c)}) {
+            std::vector<FeaturePair> pairs;
+            collect_feature_pairs(one, two, pairs);
+            const std::set<Key> found = keys(pairs), expected = near_pairs(one, two, one.reach + two.reach);
+            CHECK(found.size() == pairs.size());
+            CHECK(std::includes(found.begin(), found.end(), expected.begin(), expected.end()));
+            cases_hit += expected.size();
+            quiet += pairs.empty() ? 1 : 0;
+        }
+    }
+    CHECK(cases_hit >= 500);
+    CHECK(quiet >= 3);
+}
+
+TEST(no_pair_of_a_mesh_with_itself_is_missing_or_listed_twice) {
+    const Cloth cloth = fixtures::cloth(fixtures::grid(12, 3, 0.15));
+    check::Random random(12);
+    std::size_t cases_hit = 0, all = 0, listed = 0;
+    for (int k = 0; k < 12; ++k) {
+        NOTE(k);
+        DeformingSweep sheet = random_sheet(cloth, random, k % 2 == 0 ? 0.0 : 0.1, 0.02);
+        std::vector<FeaturePair> pairs;
+        collect_self_pairs(sheet.swept(), pairs);
+        const std::set<Key> found = self_keys(pairs), expected = near_self_pairs(sheet.swept(), 0.04);
+        CHECK(found.size() == pairs.size());
+        CHECK(std::includes(found.begin(), found.end(), expected.begin(), expected.end()));
+        const std::set<Key> without_neighbours = near_self_pairs(sheet.swept(), kInfinity);
+        CHECK(std::includes(without_neighbours.begin(), without_neighbours.end(), found.begin(), found.end()));
+        cases_hit += expected.size();
+        listed += found.size();
+        all += without_neighbours.size();
+    }
+    CHECK(cases_hit >= 200);
+    CHECK(listed < all / 4);
 }
 
 TEST(candidates_are_about_as_few_as_they_can_be) {
@@ -191,6 +306,23 @@ TEST(vertices_below_a_height_are_those_of_brute_force) {
     CHECK(cases_hit >= 100);
 }
 
+TEST(nodes_below_a_height_are_those_of_brute_force) {
+    const Cloth cloth = fixtures::cloth(fixtures::grid(6, 3, 0.2));
+    check::Random random(13);
+    std::size_t cases_hit = 0;
+    for (int k = 0; k < 20; ++k) {
+        DeformingSweep sheet = random_sheet(cloth, random, 0.2, 0.05);
+        const double height = random.uniform(-1.0, 0.0);
+        std::vector<int> expected, found;
+        for (int v = 0; v < cloth.node_count(); ++v)
+            if (std::min(sheet.begin[v].z(), sheet.end[v].z()) - 0.05 <= height) expected.push_back(v);
+        collect_vertices_below(sheet.swept(), height, found);
+        CHECK(found == expected);
+        cases_hit += expected.size();
+    }
+    CHECK(cases_hit >= 30);
+}
+
 namespace {
 
 /// Whether two boxes overlap: no axis among face normals and cross products of edges separates them.
@@ -208,6 +340,31 @@ bool boxes_overlap(const Vec3& half_a, const Pose& a, const Vec3& half_b, const 
     });
 }
 
+bool meshes_cross_at(const CollisionMesh& a, const Pose& pose_a, const CollisionMesh& b, const Pose& pose_b) {
+    return meshes_cross({&a, {pose_a, pose_a}, 0.0}, {&b, {pose_b, pose_b}, 0.0});
+}
+
+/// Whether an edge of one sheet goes through a triangle of the other, by the signs of volumes. Of one sheet (a == b),
+/// edges that end at the triangle do not.
+bool sheets_cross(const Cloth& a, const std::vector<Vec3>& xa, const Cloth& b, const std::vector<Vec3>& xb) {
+    const auto volume = [](const Vec3& p, const Vec3& q, const Vec3& r, const Vec3& s) {
+        return (q - p).dot((r - p).cross(s - p));
+    };
+    for (const Edge& edge : a.surface.edges)
+        for (const ClothTriangle& triangle : b.triangles) {
+            const auto [i, j, k] = triangle.nodes;
+            if (&a == &b &&
+                (edge.p0 == i || edge.p0 == j || edge.p0 == k || edge.p1 == i || edge.p1 == j || edge.p1 == k))
+                continue;
+            const Vec3 &p = xa[edge.p0], &q = xa[edge.p1];
+            if (volume(p, xb[i], xb[j], xb[k]) * volume(q, xb[i], xb[j], xb[k]) >= 0.0) continue;
+            const double v0 = volume(p, q, xb[i], xb[j]), v1 = volume(p, q, xb[j], xb[k]),
+                         v2 = volume(p, q, xb[k], xb[i]);
+            if ((v0 > 0.0) == (v1 > 0.0) && (v1 > 0.0) == (v2 > 0.0)) return true;
+        }
+    return false;
+}
+
 }  // namespace
 
 TEST(meshes_cross_where_boxes_overlap) {
@@ -221,8 +378,8 @@ TEST(meshes_cross_where_boxes_overlap) {
         const Pose a{random_rotation(random), random_vec3(random, 0.7)};
         const Pose b{random_rotation(random), random_vec3(random, 0.7)};
         const bool overlap = boxes_overlap(half_a, a, half_b, b);  // neither fits into the other
-        CHECK(meshes_cross(mesh_a, a, mesh_b, b) == overlap);
-        CHECK(meshes_cross(mesh_b, b, mesh_a, a) == overlap);
+        CHECK(meshes_cross_at(mesh_a, a, mesh_b, b) == overlap);
+        CHECK(meshes_cross_at(mesh_b, b, mesh_a, a) == overlap);
         (overlap ? crossing : apart) += 1;
     }
     CHECK(crossing >= 50);
@@ -232,6 +389,68 @@ TEST(meshes_cross_where_boxes_overlap) {
 TEST(a_mesh_inside_another_does_not_cross_it) {
     const CollisionMesh large = fixtures::collision_mesh(fixtures::box(Vec3(1.0, 1.0, 1.0)));
     const CollisionMesh small = fixtures::collision_mesh(fixtures::box(Vec3(0.1, 0.1, 0.1)));
-    CHECK(!meshes_cross(large, Pose{}, small, Pose{}));
-    CHECK(meshes_cross(large, Pose{}, small, Pose{Mat3::Identity(), Vec3(1.0, 0.2, 0.3)}));
+    CHECK(!meshes_cross_at(large, Pose{}, small, Pose{}));
+    CHECK(meshes_cross_at(large, Pose{}, small, Pose{Mat3::Identity(), Vec3(1.0, 0.2, 0.3)}));
+}
+
+TEST(a_segment_crosses_the_face_that_it_goes_through) {
+    const CollisionMesh cube = fixtures::collision_mesh(fixtures::box(Vec3(1, 1, 1))), rod = segment();
+    CHECK(meshes_cross_at(cube, Pose{}, rod, Pose{Mat3::Identity(), Vec3(1.0, 0.2, 0.3)}));
+    CHECK(meshes_cross_at(rod, Pose{Mat3::Identity(), Vec3(1.0, 0.2, 0.3)}, cube, Pose{}));
+    CHECK(!meshes_cross_at(cube, Pose{}, rod, Pose{Mat3::Identity(), Vec3(2.1, 0.2, 0.3)}));
+    CHECK(!meshes_cross_at(cube, Pose{}, rod, Pose{Mat3::Identity(), Vec3(1.0, 0.2, 1.1)}));
+    CHECK(!meshes_cross_at(rod, Pose{}, rod, Pose{exp_rotation(Vec3(0, 0, 1)), Vec3::Zero()}));
+}
+
+TEST(sheets_cross_where_an_edge_goes_through_a_triangle) {
+    const Cloth first = fixtures::cloth(fixtures::grid(6, 3, 0.2)), second = fixtures::cloth(fixtures::hexagon(0.5));
+    const TriangleMesh shape = fixtures::hexagon(0.5);
+    const CollisionMesh rigid = build_collision_mesh(shape.vertices, shape.triangles, Faces::separate);
+    check::Random random(14);
+    int crossing = 0, apart = 0;
+    for (int k = 0; k < 150; ++k) {
+        NOTE(k);
+        DeformingSweep a = random_sheet(first, random, 0.5, 0.0), b = random_sheet(second, random, 0.5, 0.0);
+        const Pose pose{random_rotation(random), random_vec3(random, 0.6)};
+        b.begin = fixtures::moved(second.rest, pose.R, pose.t);
+        const bool expected =
+            sheets_cross(first, a.begin, second, b.begin) || sheets_cross(second, b.begin, first, a.begin);
+        CHECK(meshes_cross(a.swept(), b.swept()) == expected);
+        CHECK(meshes_cross(a.swept(), {&rigid, {pose, pose}, 0.0}) == expected);
+        (expected ? crossing : apart) += 1;
+    }
+    CHECK(crossing >= 20);
+    CHECK(apart >= 20);
+}
+
+TEST(a_sheet_crosses_itself_where_an_edge_goes_through_a_triangle) {
+    const Cloth sheet = fixtures::cloth(fixtures::grid(8, 2, 0.2)), pair = fixtures::cloth(fixtures::folded_pair(0.4));
+    check::Random random(15);
+    int crossing = 0, apart = 0;
+    for (int k = 0; k < 150; ++k) {
+        NOTE(k);
+        DeformingSweep swept = random_sheet(sheet, random, 0.0, 0.0);
+        swept.begin = fixtures::shaken(fixtures::rolled(sheet.rest, 0.15, 0.1), random, random.uniform(0.0, 0.15));
+        const bool expected = sheets_cross(sheet, swept.begin, sheet, swept.begin);
+        CHECK(crosses_itself(swept.swept()) == expected);
+        (expected ? crossing : apart) += 1;
+    }
+    CHECK(crossing >= 20);
+    CHECK(apart >= 20);
+    // Two triangles with a common side cannot.
+    for (const double angle : {0.0, 0.4, 3.1, -3.1}) {
+        DeformingSweep swept{&pair.surface, fixtures::folded_pair(angle).vertices, {}, 0.0};
+        swept.end = swept.begin;
+        CHECK(!crosses_itself(swept.swept()));
+    }
+}
+
+TEST(triangles_with_one_common_node_can_cross) {
+    const TriangleMesh mesh{{{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {-1, 0, 0}, {-1, -1, 0}}, {{0, 1, 2}, {0, 3, 4}}};
+    const Cloth cloth = fixtures::cloth(mesh);
+    DeformingSweep swept{&cloth.surface, mesh.vertices, mesh.vertices, 0.0};
+    CHECK(!crosses_itself(swept.swept()));
+    swept.begin[3] = Vec3(0.5, 0.25, 0.3);
+    swept.begin[4] = Vec3(0.5, 0.25, -0.3);
+    CHECK(crosses_itself(swept.swept()));
 }

@@ -2,8 +2,8 @@
 
 #include <Eigen/LU>
 
+#include "cloth_fixtures.hpp"
 #include "contact/zone_solver.hpp"
-#include "fixtures.hpp"
 
 using namespace diffsim;
 using fixtures::dense;
@@ -20,9 +20,17 @@ constexpr double kSameSystem = 1e-9;
 constexpr double kDifferences = 1e-6;
 constexpr double kStep = 2e-6;
 
-/// Bodies at rest or landing, and how they are solved.
+/// The nodes of a cloth.
+struct Sheet {
+    std::vector<Vec3> start, target;
+    std::vector<double> mass;
+};
+
+/// Bodies and cloths at rest or landing, and how they are solved.
 struct Scene {
     Model model;
+    std::vector<Sheet> sheets;
+    std::vector<ClothParameters> materials;
     std::vector<ZoneBody> bodies;
     PassiveBodies passive;
     double compliance = 1e-4;
@@ -48,13 +56,36 @@ struct Scene {
             boxes.push_back(swept_box({&model.bodies[body.id].mesh, {body.start, body.start}, 0.1}));
         passive.tree = build_box_tree(boxes);
     }
+    void add_sheet(const fixtures::TriangleMesh& rest, const std::vector<Vec3>& start, const std::vector<int>& pinned) {
+        Cloth cloth = fixtures::cloth(rest, 0.5 * kThickness);
+        cloth.first_node = model.node_count();
+        for (int node : pinned) cloth.pinned[node] = 1;
+        materials.push_back({0.5, 800.0, 200.0, 1e-3, 0.005});
+        sheets.push_back({start, {}, {}});
+        for (std::size_t k = 0; k < start.size(); ++k) {
+            sheets.back().target.push_back(kDt * kDt * Vec3(0.3, -0.2, -9.81) * 10.0);
+            sheets.back().mass.push_back(materials.back().density * cloth.node_area[k]);
+        }
+        for (int node : pinned) sheets.back().target[node].setZero();
+        model.cloths.push_back(cloth);
+    }
     Zone zone() const {
         Zone result;
+        result.dt = kDt;
+        result.cloth_parameters = &materials;
         result.model = &model;
-        result.compliance = compliance;
+        set_compliance(result, compliance);
         result.ground_height = model.ground.height;
         result.bodies = bodies;
         result.dynamic_count = static_cast<int>(bodies.size());
+        for (int i = 0; i < model.cloth_count(); ++i) {
+            fixtures::add_zone_cloth(result, i, sheets[i].start, materials[i]);
+            for (std::size_t k = 0; k < sheets[i].start.size(); ++k) {
+                ZoneNode& node = result.nodes[result.cloths.back().first_node + static_cast<int>(k)];
+                node.target = sheets[i].target[k];
+                node.mass = sheets[i].mass[k];
+            }
+        }
         return result;
     }
     /// The zone at its solution, with its active contacts only.
@@ -105,8 +136,34 @@ Scene landing() {
     return scene;
 }
 
+/// A box that lands on a sheet held at its corners, above a fixed block and next to a small sheet on the ground, of which
+/// it hits the edge.
+Scene caught() {
+    Scene scene;
+    scene.model.thickness = kThickness;
+    scene.model.ground = {true, -0.1, 0.5 * kThickness};
+    scene.add_static(Vec3(0.05, 0.05, 0.03), {exp_rotation(Vec3(0.1, 0.2, 0.1)), Vec3(0.2, 0.2, -0.05)});
+    scene.add(Vec3(0.08, 0.06, 0.03), {exp_rotation(Vec3(0.1, -0.15, 0.3)), Vec3(0.12, 0.15, 0.05)}, 0.4);
+    scene.bodies[0].target << 0.05, -0.1, 0.1, 0.005, 0.003, -0.04;
+    check::Random random(11);
+    const fixtures::TriangleMesh large = fixtures::grid(3, 3, 0.1), small = fixtures::grid(1, 1, 0.1);
+    scene.add_sheet(large, fixtures::shaken(large.vertices, random, 0.002), {0, 3, 12});
+    scene.sheets[0].target[3] = Vec3(0.002, 0.001, 0.003);  // driven
+    scene.add_sheet(
+        small, fixtures::moved(small.vertices, exp_rotation(Vec3(0.05, 0.03, 0.4)), Vec3(0.03, 0.06, -0.005)), {});
+    for (Vec3& target : scene.sheets[1].target) target = Vec3(0.003, 0.002, 0.02);
+    return scene;
+}
+
 Coordinates random_upstream(const Zone& zone, std::uint64_t seed) {
-    return unflatten(check::Random(seed).vector(6 * zone.dynamic_count));
+    return unflatten(check::Random(seed).vector(6 * zone.dynamic_count + 3 * zone.node_count()), zone.dynamic_count);
+}
+
+/// Nothing at pinned nodes, which do not answer.
+Coordinates without_pinned(const Zone& zone, Coordinates y) {
+    for (int i = 0; i < zone.node_count(); ++i)
+        if (zone.nodes[i].pinned) y.nodes[i].setZero();
+    return y;
 }
 
 VectorX multiplier(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode) {
@@ -123,7 +180,7 @@ void check_same_system(const Zone& zone, const ZonePoint& point) {
         ZoneDerivatives derivatives;
         system.set_pattern(base_pattern(zone));
         differentiate(zone, point, Curvature::dropped, derivatives, &system);
-        const VectorX direct = dense(system).ldlt().solve(flatten(upstream));
+        const VectorX direct = dense(system).ldlt().solve(flatten(without_pinned(zone, upstream)));
         CHECK(by_lu.norm() > 0.0);
         CHECK_NEAR(by_qr, by_lu, kSameSystem * by_lu.norm());
         CHECK_NEAR(direct, by_lu, kSameSystem * by_lu.norm());
@@ -166,6 +223,115 @@ TEST(dense_and_qr_do_without_contacts) {
     evaluate(zone, point);
     CHECK(point.active.empty());
     check_same_system(zone, point);
+}
+
+TEST(dense_and_qr_solve_the_same_system_with_cloth) {
+    for (const double compliance : {1e-4, 1e-2}) {
+        NOTE(compliance);
+        Scene scene = caught();
+        scene.compliance = compliance;
+        ZonePoint point;
+        const Zone zone = scene.solve(point);
+        CHECK(point.active.size() >= 4);
+        check_same_system(zone, point);
+    }
+}
+
+TEST(all_modes_agree_on_hard_contacts_with_cloth_as_far_as_they_are_straight) {
+    Scene scene = caught();
+    scene.compliance = 0.0;
+    ZonePoint point;
+    const Zone zone = scene.solve(point);
+    CHECK(point.active.size() >= 4);
+    const Coordinates upstream = random_upstream(zone, 8);
+    const VectorX by_lu = multiplier(zone, point, upstream, AdjointMode::dense);
+    const VectorX by_qr = multiplier(zone, point, upstream, AdjointMode::qr);
+    CHECK(by_lu.norm() > 0.0);
+    CHECK_NEAR(by_qr, by_lu, 1e-8 * by_lu.norm());
+    // J z = 0: no contact opens or closes along z.
+    BlockSystem system;
+    const Coordinates z = zone_adjoint(zone, point, upstream, AdjointMode::dense, system).multiplier;
+    const auto distances_at = [&](double s) {
+        ZonePoint moved;
+        moved.y = point.y;
+        for (std::size_t i = 0; i < z.bodies.size(); ++i) moved.y.bodies[i] += s * z.bodies[i];
+        for (std::size_t i = 0; i < z.nodes.size(); ++i) moved.y.nodes[i] += s * z.nodes[i];
+        evaluate(zone, moved);
+        return VectorX(
+            Eigen::Map<const VectorX>(moved.distances.data(), static_cast<Eigen::Index>(moved.distances.size())));
+    };
+    const double step = 1e-7 / by_lu.cwiseAbs().maxCoeff();
+    const VectorX rate = (distances_at(step) - distances_at(-step)) / (2.0 * step);
+    CHECK(rate.cwiseAbs().maxCoeff() <= 1e-6 * by_lu.norm());
+}
+
+TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
+    for (const double compliance : {1e-4, 1e-1}) {
+        NOTE(compliance);
+        Scene scene = caught();
+        scene.compliance = compliance;
+        ZonePoint point;
+        const Zone zone = scene.solve(point);
+        CHECK(point.active.size() >= 4);
+        const Coordinates upstream = random_upstream(zone, 9);
+        BlockSystem system;
+        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, system);
+        // What the loss sees of pinned nodes is their own motion, which is not the adjoint's part.
+        const VectorX weights = flatten(without_pinned(zone, upstream));
+        const auto loss = [&](const Scene& changed) { return weights.dot(changed.solution()); };
+        const auto numeric = [&](double step, Eigen::Index size, const auto& change) {
+            const auto at = [&](const VectorX& x) {
+                Scene changed = scene;
+                change(changed, x);
+                return loss(changed);
+            };
+            return fixtures::numeric_gradient(at, VectorX::Zero(size), step);
+        };
+        Vec6 by_target;
+        const Vec6& z = adjoint.multiplier.bodies[0];
+        by_target << scene.bodies[0].inertia * z.head<3>(), scene.bodies[0].mass * z.tail<3>();
+        CHECK_NEAR(
+            by_target, numeric(kStep, 6, [](Scene& s, const VectorX& x) { s.bodies[0].target += x; }), kDifferences);
+
+        const double scale = flatten(adjoint.place_gradient).norm();
+        CHECK(scale > 0.1);
+        double by_stiffness = 0.0;
+        for (std::size_t sheet = 0; sheet < 2; ++sheet) {
+            NOTE(sheet);
+            const int first = zone.cloths[sheet].first_node;
+            for (std::size_t k = 0; k < scene.sheets[sheet].start.size(); k += sheet == 0 ? 3 : 2) {
+                NOTE(k);
+                const int i = first + static_cast<int>(k);
+                const ZoneNode& node = zone.nodes[i];
+                const Vec3& z_node = adjoint.multiplier.nodes[i];
+                const Vec3 &place = adjoint.place_gradient.nodes[i], &start = adjoint.start_gradient[i];
+                const VectorX targeted =
+                    numeric(kStep, 3, [&](Scene& s, const VectorX& x) { s.sheets[sheet].target[k] += x; });
+                CHECK_NEAR(node.pinned ? place : Vec3(node.mass * z_node), targeted, kDifferences * (1.0 + scale));
+                const VectorX started =
+                    numeric(kStep, 3, [&](Scene& s, const VectorX& x) { s.sheets[sheet].start[k] += x; });
+                CHECK_NEAR(place + start, started, kDifferences * (1.0 + scale));
+                const double by_mass = adjoint.node_mass_gradient[i] - z_node.dot(point.y.nodes[i] - node.target);
+                const double weighed = numeric(
+                    1e-3 * node.mass, 1, [&](Scene& s, const VectorX& x) { s.sheets[sheet].mass[k] += x[0]; })[0];
+                CHECK_NEAR(by_mass, weighed, 1e-4 * std::abs(by_mass) + 1e-7);
+                by_stiffness += std::abs(adjoint.node_mass_gradient[i]);
+            }
+            const std::pair<double ClothParameters::*, double> fields[] = {
+                {&ClothParameters::stretch, adjoint.cloth_gradient[sheet].stretch},
+                {&ClothParameters::shear, adjoint.cloth_gradient[sheet].shear},
+                {&ClothParameters::bend, adjoint.cloth_gradient[sheet].bend},
+                {&ClothParameters::damping, adjoint.cloth_gradient[sheet].damping}};
+            for (const auto& [field, analytic] : fields) {
+                const double value = scene.materials[sheet].*field;
+                const double by_difference = numeric(
+                    1e-3 * value, 1, [&, f = field](Scene& s, const VectorX& x) { s.materials[sheet].*f += x[0]; })[0];
+                CHECK(analytic != 0.0);
+                CHECK_NEAR(analytic * value, by_difference * value, 1e-4 * std::abs(analytic * value) + 1e-9);
+            }
+        }
+        CHECK(by_stiffness > 0.0);
+    }
 }
 
 TEST(exact_adjoint_agrees_with_differences_of_the_solve) {

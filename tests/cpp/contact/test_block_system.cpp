@@ -21,10 +21,35 @@ Pairs random_pairs(check::Random& random, int count) {
     return pairs;
 }
 
-/// Σ over pairs of a random 12x12 Gram matrix, plus the identity.
+/// Bodies in a chain, nodes in another, and each body coupled to some nodes.
+BlockPattern random_pattern(check::Random& random, int bodies, int nodes) {
+    BlockPattern pattern{bodies, nodes, random_pairs(random, bodies), {}, random_pairs(random, nodes)};
+    for (int i = 0; i < bodies; ++i)
+        for (int j = 0; j < nodes; ++j)
+            if (random.uniform(0.0, 1.0) < 3.0 / nodes) pattern.mixed_pairs.emplace_back(i, j);
+    return pattern;
+}
+
+/// Σ over pairs of a random Gram matrix, plus the identity.
 void fill(BlockSystem& system, check::Random& random) {
     system.set_zero();
-    for (int i = 0; i < system.pattern().body_count; ++i) system.diagonal(i) = Mat6::Identity();
+    const BlockPattern& pattern = system.pattern();
+    for (int i = 0; i < pattern.body_count; ++i) system.diagonal(i) = Mat6::Identity();
+    for (int i = 0; i < pattern.node_count; ++i) system.node_diagonal(i) = Mat3::Identity();
+    for (std::size_t k = 0; k < pattern.node_pairs.size(); ++k) {
+        const auto [i, j] = pattern.node_pairs[k];
+        const MatrixX rows = random.matrix(6, 6), gram = rows * rows.transpose();
+        system.node_diagonal(i) += gram.topLeftCorner<3, 3>();
+        system.node_diagonal(j) += gram.bottomRightCorner<3, 3>();
+        system.node_pair(static_cast<int>(k)) += gram.topRightCorner<3, 3>();
+    }
+    for (std::size_t k = 0; k < pattern.mixed_pairs.size(); ++k) {
+        const auto [i, j] = pattern.mixed_pairs[k];
+        const MatrixX rows = random.matrix(9, 9), gram = rows * rows.transpose();
+        system.diagonal(i) += gram.topLeftCorner<6, 6>();
+        system.node_diagonal(j) += gram.bottomRightCorner<3, 3>();
+        system.mixed_pair(static_cast<int>(k)) += gram.topRightCorner<6, 3>();
+    }
     for (std::size_t k = 0; k < system.pattern().body_pairs.size(); ++k) {
         const auto [i, j] = system.pattern().body_pairs[k];
         const MatrixX rows = random.matrix(12, 12), gram = rows * rows.transpose();
@@ -38,7 +63,7 @@ void check_solution(BlockSystem& system, check::Random& random) {
     const MatrixX matrix = fixtures::dense(system);
     const VectorX rhs = random.vector(matrix.rows());
     CHECK(system.factorize());
-    Coordinates x = fixtures::unflatten(rhs), product;
+    Coordinates x = fixtures::unflatten(rhs, system.pattern().body_count), product;
     system.multiply(x, product);
     CHECK_NEAR(fixtures::flatten(product), matrix * rhs, kRounding * matrix.norm());
     system.solve_in_place(x);
@@ -103,4 +128,52 @@ TEST(block_system_refuses_what_is_not_positive_definite) {
         fill(system, random);
         CHECK(system.factorize());
     }
+}
+
+TEST(block_system_of_bodies_and_nodes_agrees_with_a_dense_matrix) {
+    check::Random random(5);
+    BlockSystem system;
+    for (const auto& [bodies, nodes] :
+         {std::pair(0, 1), std::pair(0, 30), std::pair(1, 1), std::pair(2, 40), std::pair(12, 25), std::pair(3, 0),
+          std::pair(2, 40)}) {
+        NOTE(bodies);
+        NOTE(nodes);
+        const BlockPattern pattern = random_pattern(random, bodies, nodes);
+        system.set_pattern(pattern);
+        CHECK(system.pattern() == pattern);
+        fill(system, random);
+        check_solution(system, random);
+        fill(system, random);  // the same pattern, other numbers
+        check_solution(system, random);
+        if (nodes == 0) continue;
+        fill(system, random);
+        system.node_diagonal(nodes - 1)(2, 2) = -1.0;
+        CHECK(!system.factorize());
+    }
+}
+
+TEST(block_system_finds_its_pairs) {
+    check::Random random(6);
+    const int bodies = 5, nodes = 20;
+    const BlockPattern pattern = random_pattern(random, bodies, nodes);
+    BlockSystem system;
+    system.set_pattern(pattern);
+    int mixed = 0, pairs = 0;
+    for (int j = 0; j < nodes; ++j) {
+        for (int i = 0; i < bodies; ++i) {
+            const int found = system.find_mixed_pair(i, j);
+            if (found < 0) continue;
+            CHECK(pattern.mixed_pairs[static_cast<std::size_t>(found)] == std::pair(i, j));
+            ++mixed;
+        }
+        for (int i = 0; i < j; ++i) {
+            const int found = system.find_node_pair(i, j);
+            if (found < 0) continue;
+            CHECK(pattern.node_pairs[static_cast<std::size_t>(found)] == std::pair(i, j));
+            ++pairs;
+        }
+    }
+    CHECK(mixed == static_cast<int>(pattern.mixed_pairs.size()));
+    CHECK(pairs == static_cast<int>(pattern.node_pairs.size()));
+    CHECK(mixed >= 5);
 }

@@ -19,10 +19,15 @@ struct Problem {
     Coordinates inertial_gradient;
     std::vector<double> mass_factor;
     std::vector<ImpactRow> rows;
+    BlockSystem cloth;  // of the nodes, where there are any
 
-    Eigen::Index size() const { return 6 * zone.dynamic_count; }
+    Eigen::Index size() const { return 6 * zone.dynamic_count + 3 * zone.node_count(); }
+    Eigen::Index node_row(int node) const { return 6 * zone.dynamic_count + 3 * node; }
+    /// The quadratic part. Pinned nodes have the unit matrix, so that they stay where they start, at zero.
     MatrixX mass() const {
         MatrixX M = MatrixX::Zero(size(), size());
+        if (zone.node_count() > 0)
+            M.bottomRightCorner(3 * zone.node_count(), 3 * zone.node_count()) = fixtures::dense(cloth);
         for (int i = 0; i < zone.dynamic_count; ++i) {
             const ZoneBody& body = zone.bodies[i];
             M.block<3, 3>(6 * i, 6 * i) = mass_factor[i] * body.inertia;
@@ -34,6 +39,8 @@ struct Problem {
         VectorX full = VectorX::Zero(size());
         if (r.a >= 0) full.segment<6>(6 * r.a) = r.row_a;
         if (r.b >= 0) full.segment<6>(6 * r.b) = r.row_b;
+        for (int k = 0; k < r.node_count; ++k)
+            full.segment<3>(node_row(r.nodes[static_cast<std::size_t>(k)])) = r.node_rows[static_cast<std::size_t>(k)];
         return full;
     }
     VectorX gradient(const VectorX& p) const {
@@ -48,8 +55,19 @@ struct Problem {
     }
     int solve(Coordinates& p) const {
         BlockSystem system;
-        system.set_pattern(base_pattern(zone));
-        return solve_impact_qp(zone, inertial_gradient, mass_factor, nullptr, rows, system, p);
+        system.set_pattern(pattern());
+        const BlockSystem* nodes = zone.node_count() > 0 ? &cloth : nullptr;
+        return solve_impact_qp(zone, inertial_gradient, mass_factor, nodes, rows, system, p);
+    }
+    /// Every pair that there can be.
+    BlockPattern pattern() const {
+        BlockPattern result{zone.dynamic_count, zone.node_count(), zone.pairs, {}, {}};
+        for (int j = 0; j < zone.node_count(); ++j)
+            for (int i = 0; i < j; ++i) result.node_pairs.emplace_back(i, j);
+        for (int i = 0; i < zone.dynamic_count; ++i)
+            for (int j = 0; j < zone.node_count(); ++j) result.mixed_pairs.emplace_back(i, j);
+        std::sort(result.node_pairs.begin(), result.node_pairs.end());
+        return result;
     }
     /// The dual, one multiplier at a time:  p = M⁻¹ (Σ λ r - g),  0 ≤ λ = stiffness · violation. Slow and plain.
     VectorX reference(int sweeps) const {
@@ -97,6 +115,53 @@ Problem random_problem(check::Random& random, int bodies, int row_count, double 
         const Vec3 n = random_direction(random);
         row.row_a << fixtures::random_vec3(random).cross(n), n;
         row.row_b << fixtures::random_vec3(random).cross(-n), -n;
+        row.missing = random.uniform(-0.5, 0.5);
+        row.stiffness = stiffness * random.uniform(0.5, 2.0);
+        problem.rows.push_back(row);
+    }
+    return problem;
+}
+
+/// The same with a sheet of 3 x 3 nodes, its first corner pinned: rows push bodies against features of one to six nodes.
+Problem random_problem_with_nodes(check::Random& random, int bodies, int row_count, double stiffness) {
+    Problem problem = random_problem(random, bodies, bodies > 0 ? row_count / 3 : 0, stiffness);
+    constexpr int kNodes = 9;
+    Zone& zone = problem.zone;
+    zone.nodes.resize(kNodes);
+    zone.nodes[0].pinned = true;
+    problem.cloth.set_pattern({0, kNodes, {}, {}, {{1, 2}, {1, 4}, {2, 5}, {3, 4}, {4, 7}, {5, 8}, {6, 7}}});
+    problem.cloth.set_zero();
+    for (int i = 0; i < kNodes; ++i) {
+        zone.nodes[i].mass = random.uniform(0.1, 0.5);
+        const bool pinned = zone.nodes[i].pinned;
+        problem.cloth.node_diagonal(i) = (pinned ? 1.0 : zone.nodes[i].mass) * Mat3::Identity();
+        problem.inertial_gradient.nodes.push_back(pinned ? Vec3(Vec3::Zero()) : fixtures::random_vec3(random));
+    }
+    for (int k = 0; k < static_cast<int>(problem.cloth.pattern().node_pairs.size()); ++k) {
+        const auto [i, j] = problem.cloth.pattern().node_pairs[static_cast<std::size_t>(k)];
+        const MatrixX rows = random.matrix(6, 6), gram = 2.0 * rows * rows.transpose();
+        problem.cloth.node_diagonal(i) += gram.topLeftCorner<3, 3>();
+        problem.cloth.node_diagonal(j) += gram.bottomRightCorner<3, 3>();
+        problem.cloth.node_pair(k) = gram.topRightCorner<3, 3>();
+    }
+    while (static_cast<int>(problem.rows.size()) < row_count) {
+        ImpactRow row;
+        const int sides = bodies > 0 && random.uniform() < 0.0 ? 1 : 2;
+        const Vec3 n = random_direction(random);
+        if (sides == 1) {
+            row.a = static_cast<int>(random.uniform(0.0, bodies));
+            row.row_a << fixtures::random_vec3(random).cross(n), n;
+        }
+        std::vector<int> order(kNodes - 1);
+        for (int i = 1; i < kNodes; ++i) order[static_cast<std::size_t>(i - 1)] = i;
+        row.node_count = static_cast<int>(random.uniform(1.0, 3.0 * sides + 1.0));
+        for (std::size_t k = 0; k < static_cast<std::size_t>(row.node_count); ++k) {
+            const auto picked =
+                order.begin() + static_cast<int>(random.uniform(0.0, static_cast<double>(order.size())));
+            row.nodes[k] = *picked;  // in any order
+            order.erase(picked);
+            row.node_rows[k] = random.uniform(-1.0, 1.0) * n;
+        }
         row.missing = random.uniform(-0.5, 0.5);
         row.stiffness = stiffness * random.uniform(0.5, 2.0);
         problem.rows.push_back(row);
@@ -154,6 +219,26 @@ TEST(impact_qp_agrees_with_a_slow_reference) {
         CHECK_NEAR(found, reference, 1e-7 * (1.0 + reference.norm()));  // what the solver's tolerance is worth in p
         for (int trial = 0; trial < 10; ++trial)
             CHECK(problem.energy(found + 1e-3 * random.vector(found.size())) > problem.energy(found));
+        cases_hit += active_rows(problem, found) >= 2 ? 1 : 0;
+    }
+    CHECK(cases_hit >= 10);
+}
+
+TEST(impact_qp_with_nodes_agrees_with_a_slow_reference) {
+    check::Random random(5);
+    int cases_hit = 0;
+    for (int k = 0; k < 20; ++k) {
+        NOTE(k);
+        const Problem problem = random_problem_with_nodes(random, k % 4, 6 + k % 7, 100.0);
+        Coordinates p = fixtures::unflatten(VectorX::Zero(problem.size()), problem.zone.dynamic_count);
+        const double start = problem.gradient(flatten(p)).norm();
+        const int steps = problem.solve(p);
+        CHECK(steps >= 1);
+        CHECK(steps < 100);
+        CHECK(p.nodes[0].isZero(0.0));
+        const VectorX found = flatten(p), reference = problem.reference(4000);
+        CHECK(problem.gradient(found).norm() <= kOptimality * start + 1e-10);
+        CHECK_NEAR(found, reference, 1e-7 * (1.0 + reference.norm()));
         cases_hit += active_rows(problem, found) >= 2 ? 1 : 0;
     }
     CHECK(cases_hit >= 10);
