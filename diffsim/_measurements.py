@@ -76,8 +76,8 @@ class Measurements(nn.Module):
         bodies, of a body or a cloth and the ground, of a cloth and another object or itself.
 
         Of two objects at least one is a dynamic body or a cloth. Within a cloth, features that share a node do not
-        count, and of two that are nearer at rest than the cloth is thick, half their distance at rest takes the place of
-        the margins, as in contact: a sheet that lies flat reports about the size of its triangles.
+        count, and of two that are nearer at rest than the cloth is thick, half their distance at rest takes the place
+        of the margins, as in contact: a sheet that lies flat reports about the size of its triangles.
 
         Returns: A float; for a state with leading axes a tensor of their shape. Infinite if nothing can meet. Not
             differentiable.

@@ -87,7 +87,7 @@ class Simulator(Measurements):
         adjoint: str = "exact",
         coupling: str = "monolithic",
         tolerance: float = 1e-10,
-        max_iterations: int = 500,
+        max_iterations: int = 2000,
         num_threads: int | None = None,
         on_failure: str = "warn",
         check: bool = True,

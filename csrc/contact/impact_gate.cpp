@@ -19,6 +19,15 @@ Vec3 in_body(const Zone& zone, int body, const Vec6& y, const Vec3& point) {
 
 }  // namespace
 
+bool may_pass(const Zone& zone, const Coordinates& y_end) {
+    double smallest = kInfinity, furthest = 0.0;
+    for (int i = 0; i < zone.body_count(); ++i) {
+        smallest = std::min(smallest, size(zone, i));
+        furthest = std::max(furthest, y_end.bodies[i].tail<3>().norm());
+    }
+    return 2.0 * furthest > kPassingPart * smallest;
+}
+
 std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& point, const Coordinates& y_end) {
     std::vector<ImpactGate> gates;
     std::vector<Impact> impacts;
@@ -43,7 +52,7 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
             zone.ground_height);
         gates.push_back(
             {a, b, in_body(zone, a, y_a, geometry.closest.point_a), in_body(zone, b, y_b, geometry.closest.point_b),
-             geometry.normal, passing});
+             geometry.normal, contact.range.rest, passing});
     }
     return gates;
 }
@@ -52,7 +61,7 @@ bool gates_hold(const std::vector<ImpactGate>& gates, const Zone& zone, const Co
     return std::all_of(gates.begin(), gates.end(), [&](const ImpactGate& gate) {
         const Vec3 x_a = pose_at(zone.bodies[gate.a], y.bodies[gate.a]) * gate.point_a;
         const Vec3 x_b = pose_at(zone.bodies[gate.b], y.bodies[gate.b]) * gate.point_b;
-        return gate.normal.dot(x_a - x_b) >= -gate.allowed_passing;
+        return gate.normal.dot(x_a - x_b) - gate.rest >= -gate.allowed_passing;
     });
 }
 

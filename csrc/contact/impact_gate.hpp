@@ -14,8 +14,12 @@ struct ImpactGate {
     int a, b;                ///< bodies of the zone
     Vec3 point_a, point_b;   ///< that meet, body frames
     Vec3 normal;             ///< from b to a, zone frame
+    double rest;             ///< distance along it at which their surfaces touch [m]
     double allowed_passing;  ///< [m]
 };
+
+/// Whether some body moves so far, for the size of the smallest, that two may have gates. Cheap.
+bool may_pass(const Zone& zone, const Coordinates& y_end);
 
 /// The gates of a step from an evaluated point to y_end. Bodies that move little for their size have none.
 std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& point, const Coordinates& y_end);

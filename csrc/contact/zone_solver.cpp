@@ -106,13 +106,16 @@ private:
 
     /// Nothing touches on the way to the target and there: done without an iteration.
     bool try_free_motion() {
-        if (!m_w.point.active.empty()) return false;
         m_w.y_end.bodies.resize(m_zone.bodies.size());
         set_to_targets(m_w.y_end);
-        if (m_zone.dynamic_count > 0 && allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
+        const bool touching = !m_w.point.active.empty();
+        if (touching && !may_pass(m_zone, m_w.y_end)) return false;
+        if ((m_zone.dynamic_count > 0 || !m_zone.elastic) &&
+            allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
             m_gates = find_impact_gates(m_zone, m_w.point, m_w.y_end);
             return false;
         }
+        if (touching) return false;
         if (!m_zone.cloths.empty() && m_zone.elastic) return false;
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial);
@@ -324,9 +327,10 @@ private:
 
             if (!driven && relaxations == 0) {
                 const double step = past_impacts(0.0, false);
-                if (!advance_drives(step, stalls)) return fail(ZoneStatus::blocked);
+                const DriveProgress progress = advance_drives(step, stalls);
+                if (progress == DriveProgress::blocked) return fail(ZoneStatus::blocked);
                 if (step < 1.0) relaxations = kRelaxations;
-                accept_trial();
+                if (progress == DriveProgress::moved) accept_trial();
                 continue;
             }
             relaxations = now.residual < kRelaxed ? 0 : std::max(relaxations - 1, 0);
@@ -388,11 +392,12 @@ private:
     }
 
     /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
-    bool advance_drives(double step, int& stalls) {
+    /// Where there is no room at all, what is in the way may make some in Newton steps of its own.
+    enum class DriveProgress { moved, waits, blocked };
+    DriveProgress advance_drives(double step, int& stalls) {
         stalls = step < kStall ? stalls + 1 : 0;
-        if (stalls > kMaxStalls || step == 0.0) return false;
-        const double reached = clear_step(m_w.y_end);
-        return reached > 0.0;
+        if (stalls > kMaxStalls) return DriveProgress::blocked;
+        return step > 0.0 && clear_step(m_w.y_end) > 0.0 ? DriveProgress::moved : DriveProgress::waits;
     }
 
     /// One more full Newton step, past the tolerance: it takes the solution to rounding, which gradients feel.

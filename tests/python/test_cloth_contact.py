@@ -80,13 +80,8 @@ def fall(onto: str) -> ds.Scene:
     return scene
 
 
-PASSES = pytest.mark.xfail(
-    strict=True,
-    reason="split: cloth whose first contact is a body that does not yield passes it in one step, 0.014 m for a "
-    "thickness of 0.0003 m: contacts 0, converged",
-)
 FALLS = [
-    pytest.param(onto, coupling, dt, marks=PASSES if (onto, coupling, dt) == ("box", "split", 0.01) else ())
+    (onto, coupling, dt)
     for onto in ("sphere", "box", "free box", "ground", "itself")
     for coupling in ("monolithic", "split")
     for dt in (0.01, 0.02)

@@ -188,10 +188,6 @@ def test_batches() -> None:
     assert_within_tolerance(report.stable)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="in step 8 the zone says, after 0 iterations, that a driven body is blocked; nothing is squeezed",
-)
 def test_pins_that_shiver_under_a_body_reach_their_targets() -> None:
     sim = simulator("body on cloth")
     state = sim.initial_state()

@@ -14,7 +14,7 @@ ROOMS = {
     "model": ["geometry"],
     "dynamics": ["model", "geometry"],
     "collision": ["geometry"],
-    "contact": ["model", "collision"],
+    "contact": ["dynamics", "collision"],
     "step": ["dynamics", "contact"],
     "scene_queries": ["step"],
     "rollout": ["scene_queries"],

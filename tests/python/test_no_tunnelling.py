@@ -158,3 +158,35 @@ def test_distances_of_the_judge() -> None:
     vertices, faces = ds.shapes.torus()
     assert winding_number(np.array([0.4, 0.01, 0.0]), vertices[faces]) == pytest.approx(1.0)
     assert winding_number(np.array([0.0, 0.0, 0.0]), vertices[faces]) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("speed", [15.0, 20.0, 30.0, 50.0, 100.0])
+def test_a_box_that_slides_on_the_ground_does_not_pass_one_at_rest(speed: float) -> None:
+    scene = ds.Scene()
+    scene.add_ground()
+    for x in (-0.25, 0.0):
+        scene.add_body(ds.shapes.box(0.1), density=1000.0, position=(x, 0.0, 0.05))
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.rollout(sim.initial_state(), None, 5)[-1]  # at rest, in contact with the ground
+    velocity = state.velocity.clone()
+    velocity[0, 0] = speed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        end = sim(state.replace(velocity=velocity))
+    assert end.position[0, 0] < end.position[1, 0]
+    assert end.velocity[1, 0] > 1e-3  # it was pushed
+    assert sim.kinetic_energy(end) <= 0.5 * sim.mass[0] * speed**2
+
+
+@pytest.mark.parametrize("speed", [5.0, 10.0, 20.0])
+def test_balls_that_glance_off_each_other_gain_no_energy(speed: float) -> None:
+    scene = ds.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_sphere(0.1, density=1000.0, position=(-0.15, 0.0, 0.0), velocity=(speed, 0.0, 0.0))
+    scene.add_sphere(0.1, density=1000.0, position=(0.15, 0.05, 0.0), velocity=(-speed, 0.0, 0.0))
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    energy = sim.kinetic_energy(state)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        state = sim.rollout(state, None, 5)[-1]
+    assert sim.kinetic_energy(state) < 0.6 * energy  # they met: the approach along the line of centres is gone
