@@ -62,7 +62,7 @@ struct Options {
     double compliance = kDefaultCompliance;    ///< inverse contact stiffness in units of (reduced mass / step²) [1]
     AdjointMode adjoint = AdjointMode::exact;  ///<
     double tolerance = 1e-10;                  ///< on the force balance, relative to the largest contact force [1]
-    int max_iterations = 2000;                 ///< Newton steps per zone and step
+    int max_iterations = 200;                  ///< Newton steps per zone and step
     bool split = false;  ///< cloth moves without contact first, then contacts act on its nodes (split coupling)
 };
 
