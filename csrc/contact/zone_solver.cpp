@@ -132,10 +132,10 @@ private:
             if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
         if (largest_move() < kEpsilon * m_position) return;
         ensure_covered(m_w.y_end);
-        // Where cloth strikes it stops short of the contacts: near their poles, many nodes at once, Newton's method would
-        // have to climb out again.
-        const double step = m_zone.nodes.empty() ? clear_step(m_w.y_end) : clear_step(m_w.y_end, Clearance::landing);
-        if (step > 0.0) accept_trial();
+        // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and
+        // descend from there to minimisers that no motion of that energy can reach.
+        const double step = clear_step(m_w.y_end, Clearance::landing);
+        if (step > 0.0 && m_w.trial.energy <= m_w.point.energy) accept_trial();
     }
 
     // --- moving ------------------------------------------------------------------------------------------------

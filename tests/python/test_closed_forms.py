@@ -322,3 +322,42 @@ def test_two_spheres_that_collide_stay_together(mass_ratio: float) -> None:
     assert bool(((by_mass - expected).abs() <= COMPLIANCE * (v[0] - v[1]).abs() / m).all())
     if mass_ratio == 1.0:
         assert bool((expected.abs() > 100 * COMPLIANCE * (v[0] - v[1]).abs() / m).all())
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.0025, 0.000625])
+@pytest.mark.parametrize("compliance", [1e-4, 1e-6, 0.0])
+def test_no_step_of_boxes_that_slide_into_each_other_gains_energy(dt: float, compliance: float) -> None:
+    # Equally high and flat on the ground, so that their faces are coplanar; 0.5 mm thick, about to meet with a corner.
+    scene = ds.Scene()
+    scene.add_ground()
+    for position, orientation, velocity, spin in (
+        (
+            (0.601232925, 0.0190747422, 0.0104999939),
+            (-0.35876, -0.60934, -0.35876, 0.60934),
+            (0.5412, -0.3599, 0),
+            5.3767,
+        ),
+        (
+            (0.62784876, 0.236855228, 0.0104999939),
+            (-0.29870, -0.64092, -0.29870, 0.64092),
+            (0.6567, -0.2348, 0),
+            4.7393,
+        ),
+    ):
+        scene.add_body(
+            ds.shapes.box((0.02, 0.1, 0.2)),
+            density=150.0,
+            position=position,
+            orientation=orientation,
+            velocity=velocity,
+            angular_velocity=(0.0, 0.0, spin),
+        )
+    sim = ds.Simulator(scene, dt, thickness=0.0005, compliance=compliance, on_failure="raise")
+    state = sim.initial_state()
+    start = energy = float(sim.kinetic_energy(state))
+    for _ in range(round(0.02 / dt)):
+        state = sim(state)
+        now = float(sim.kinetic_energy(state))
+        assert now <= energy * (1.0 + 1e-3)
+        energy = now
+    assert energy < 0.95 * start  # they met
