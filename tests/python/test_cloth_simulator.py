@@ -86,6 +86,41 @@ def test_crossing_cloth_is_refused_unless_unchecked() -> None:
     ds.Simulator(scene, dt=0.01, check=False)
 
 
+def test_states_whose_cloth_crosses_are_refused_by_name(sim: ds.Simulator, state: ds.State) -> None:
+    def moved(nodes: slice, shift: tuple[float, float, float], turn: bool = False) -> ds.State:
+        position = state.node_position.clone()
+        position[nodes] = position[nodes][:, [2, 0, 1] if turn else [0, 1, 2]]
+        position[nodes] += torch.tensor(shift, dtype=torch.float64) - position[nodes].mean(0)
+        return state.replace(node_position=position)
+
+    sim(moved(slice(16, 25), (0, 0.1, 4.0)))
+    with pytest.raises(ValueError, match="the meshes of 'flag' and 'towel' cross; start from"):
+        sim(moved(slice(16, 25), (0.1, 0.07, 3.03), turn=True))
+    with pytest.raises(ValueError, match="the meshes of 'body_0' and 'towel' cross"):
+        sim(moved(slice(16, 25), (0.3, 0.05, 5.02)))
+    position = state.node_position.clone()
+    position[0] += torch.tensor([1.0, 0.9, 0.3])  # a corner above the far end ...
+    position[1] += torch.tensor([0.3, 0.7, -0.3])  # ... its neighbour below: their edge goes through the sheet
+    with pytest.raises(ValueError, match="the mesh of 'flag' crosses itself; start from"):
+        sim(state.replace(node_position=position))
+
+
+def test_min_distance_sees_cloth() -> None:
+    scene = ds.Scene()
+    scene.add_ground(margin=0.01)
+    scene.add_cloth(ds.shapes.sheet(0.5, 3), position=(0, 0, 0.1), margin=0.01)
+    scene.add_cloth(ds.shapes.sheet(0.5, 3), position=(0, 0, 5), margin=0.01)
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    assert sim.min_distance(state) == pytest.approx(0.08, abs=1e-12)
+    # High above the ground: one sheet with itself, a node and the diagonal next to it.
+    lifted = state.replace(node_position=state.node_position + torch.tensor([0.0, 0.0, 1.0]))
+    assert sim.min_distance(lifted) == pytest.approx(0.25 / 2**0.5 - 0.02, abs=1e-12)
+    nodes = state.node_position.clone()
+    nodes[9:, 2] = nodes[0, 2] + 0.05
+    assert sim.min_distance(state.replace(node_position=nodes)) == pytest.approx(0.03, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
