@@ -461,8 +461,14 @@ void check_other_sheet(bool split) {
 
 }  // namespace
 
-TEST(a_fast_sheet_does_not_pass_through_a_thin_plate) { check_thin_plate(false); }
-TEST(a_fast_sheet_does_not_pass_through_another) { check_other_sheet(false); }
+TEST(a_fast_sheet_does_not_pass_through_a_thin_plate) {
+    check_thin_plate(false);
+    check_thin_plate(true);
+}
+TEST(a_fast_sheet_does_not_pass_through_another) {
+    check_other_sheet(false);
+    check_other_sheet(true);
+}
 
 TEST(step_gradient_in_flight) { check_step_gradient(tumbling(), 0); }
 TEST(step_gradient_of_a_landing) { check_step_gradient(tilted_landing(), 1); }
