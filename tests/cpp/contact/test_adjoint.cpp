@@ -299,7 +299,8 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
         for (std::size_t sheet = 0; sheet < 2; ++sheet) {
             NOTE(sheet);
             const int first = zone.cloths[sheet].first_node;
-            for (std::size_t k = 0; k < scene.sheets[sheet].start.size(); k += sheet == 0 ? 3 : 2) {
+            // A driven and a free one; a corner.
+            for (const std::size_t k : sheet == 0 ? std::vector<std::size_t>{3, 5} : std::vector<std::size_t>{2}) {
                 NOTE(k);
                 const int i = first + static_cast<int>(k);
                 const ZoneNode& node = zone.nodes[i];
