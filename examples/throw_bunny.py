@@ -16,7 +16,6 @@ Writes out/throw_bunny.png and checks itself: the exit code says whether all tha
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import math
 import sys
 import time
@@ -27,10 +26,9 @@ from typing import Any
 
 import fcl
 import numpy as np
-import pymeshfix  # type: ignore[import-untyped]
 import torch
 import trimesh
-from numpy.typing import NDArray
+from _stage import Camera, FloatArray, Item, draw_items, load_figure, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -52,29 +50,13 @@ FALL = 100.0  # the squared distance must fall by this
 GRADIENT_ERROR = 1e-5  # median over random directions, relative
 CONTACTS = 2  # objects the bunny must have touched before it arrives
 
-FloatArray = NDArray[np.float64]
-
 
 # ---- scene -----------------------------------------------------------------------------------------------------------
 
 
 def load_mesh(path: str | None = None) -> Any:
     """The mesh in a file, or the bunny: closed, decimated to FACES, centred, its longest side SIZE."""
-    if path is None:
-        package = importlib.util.find_spec("pymeshfix")
-        assert package is not None and package.origin is not None
-        path = str(Path(package.origin).parent / "examples" / "StanfordBunny.ply")
-    scanned: Any = trimesh.load(path, force="mesh")
-    repaired = pymeshfix.MeshFix(scanned.vertices, scanned.faces)
-    repaired.repair()
-    mesh: Any = trimesh.Trimesh(repaired.points, repaired.faces)
-    if len(mesh.faces) > FACES:
-        mesh = mesh.simplify_quadric_decimation(face_count=FACES)
-    if not mesh.is_watertight:
-        raise ValueError(f"{path}: the decimated mesh is not closed")
-    mesh.apply_translation(-mesh.center_mass)
-    mesh.apply_scale(SIZE / mesh.extents.max())
-    return mesh
+    return load_figure(path, FACES, SIZE)
 
 
 def build_scene(mesh: trimesh.Trimesh) -> ds.Scene:
@@ -295,13 +277,13 @@ def check(throw: Throw, search: Search) -> bool:
     fall = first.loss / best.loss
     results.append((f"squared distance fell {fall:.3g} times (at least {FALL:g})", fall >= FALL))
     for name, shot in (("first", first), ("best", best)):
-        report = gradient_report(throw, shot)
+        measured = gradient_report(throw, shot)
         text = (
-            f"gradient at the {name} launch: median error {report.median_error:.1e} against central differences,"
-            f" {len(report.stable)} of {len(report.directions)} directions with unchanged contacts"
+            f"gradient at the {name} launch: median error {measured.median_error:.1e} against central differences,"
+            f" {len(measured.stable)} of {len(measured.directions)} directions with unchanged contacts"
         )
         results.append(
-            (text, report.median_error <= GRADIENT_ERROR and 2 * len(report.stable) >= len(report.directions))
+            (text, measured.median_error <= GRADIENT_ERROR and 2 * len(measured.stable) >= len(measured.directions))
         )
     for name, shot in (("first", first), ("best", best)):
         results.append(
@@ -313,89 +295,45 @@ def check(throw: Throw, search: Search) -> bool:
         results.append(
             (f"the {name} throw passes through nothing (fcl)" + "".join(f"; {f}" for f in found[:3]), not found)
         )
-    for text, passed in results:
-        print(f"{'ok  ' if passed else 'FAIL'}  {text}")
-    return all(passed for _, passed in results)
+    return report(results)
 
 
 # ---- picture ---------------------------------------------------------------------------------------------------------
 
 STROBES = (0, 7, 14, 21, 28, 35, 41, 47, 54, 60)  # steps that are drawn
-LIGHT = np.array([-0.35, -0.55, 1.0]) / np.linalg.norm([-0.35, -0.55, 1.0])
-GROUND, SHADOW = np.array([0.955, 0.955, 0.965]), np.array([0.86, 0.86, 0.885])
 COLORS = {"chute": (0.62, 0.66, 0.72), "wedge": (0.50, 0.66, 0.80), "ring": (0.30, 0.36, 0.45)}
-CAMERA_AZIMUTH, CAMERA_ELEVATION = math.radians(-62.0), math.radians(20.0)
-
-
-def project(points: Any) -> Any:
-    """Points to (right, up, towards the camera), orthographic."""
-    ca, sa, ce, se = (f(x) for x in (CAMERA_AZIMUTH, CAMERA_ELEVATION) for f in (math.cos, math.sin))
-    view = np.array([[-sa, ca, 0.0], [-ca * se, -sa * se, ce], [ca * ce, sa * ce, se]])
-    return np.asarray(points) @ view.T
+CAMERA = Camera(-62.0, 20.0)
 
 
 def draw_shot(axes: Any, throw: Throw, shot: Shot, title: str) -> None:
     """The triangles of all meshes, flat shaded, far ones first; the bunny at STROBES, all else at the end."""
     import matplotlib
-    from matplotlib.collections import PolyCollection
-
-    subdivide: Any = trimesh.remesh.subdivide_to_size
 
     names, final = throw.sim.body_names, shot.trajectory[-1]
     states = [throw.start(shot.velocity, shot.spin), *shot.trajectory]
-    items: list[tuple[Any, Any]] = [
-        (throw.sim.mesh(final, body), COLORS[name]) for body, name in enumerate(names) if body != throw.bunny
-    ]
+    items = [Item(throw.sim.mesh(final, body), COLORS[name]) for body, name in enumerate(names) if body != throw.bunny]
     colormap = matplotlib.colormaps["YlOrRd"]
     for step in STROBES:
         fraction = step / (len(states) - 1)
-        items.append((throw.sim.mesh(states[min(step, STEPS)], throw.bunny), colormap(0.15 + 0.65 * fraction)[:3]))
-    triangles: list[Any] = []
-    colors: list[Any] = []
-    for mesh, color in items:
-        fall = mesh.vertices - mesh.vertices[:, 2:] * LIGHT / LIGHT[2]
-        axes.add_collection(
-            PolyCollection(project(fall)[mesh.faces][..., :2], facecolors=SHADOW, edgecolors=SHADOW, lw=0.3)
-        )
-        vertices, faces = subdivide(mesh.vertices, mesh.faces, 0.04)  # so that sorting works
-        corners = vertices[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        brightness = 0.45 + 0.4 * np.clip(normals @ LIGHT, 0.0, 1.0) + 0.15 * np.clip(normals[:, 2], 0.0, 1.0)
-        shown = project(corners)
-        visible = project(normals)[:, 2] > 0.0
-        triangles.append(shown[visible])
-        colors.append(np.clip(brightness[visible, None] * np.array(color) * 1.08, 0.0, 1.0))
-    triangle, color = np.concatenate(triangles), np.concatenate(colors)
-    order: Any = np.argsort(triangle[..., 2].mean(axis=1))
-    shapes: Any = triangle[order][..., :2]
-    axes.add_collection(PolyCollection(shapes, facecolors=color[order], edgecolors=color[order], lw=0.25, zorder=2))
-    path = project(np.array([state.position[throw.bunny].numpy() for state in states]))
+        items.append(Item(throw.sim.mesh(states[min(step, STEPS)], throw.bunny), colormap(0.15 + 0.65 * fraction)[:3]))
+    draw_items(axes, items, CAMERA)
+    path = CAMERA.project(np.array([state.position[throw.bunny].numpy() for state in states]))
     axes.plot(path[:, 0], path[:, 1], color="0.15", lw=1.0, ls=(0, (4, 3)), zorder=3)
-    target = project(throw.target.numpy()[None])[0]
+    target = CAMERA.project(throw.target.numpy()[None])[0]
     axes.plot(*target[:2], marker="+", ms=15, mew=2.0, color="#0a7d33", zorder=4)
     axes.plot(*path[-1, :2], marker="o", ms=4.5, color="black", zorder=4)
     axes.set_title(title, fontsize=11, color="0.2")
-    axes.set(xlim=(-0.13, 1.82), ylim=(-0.32, 1.07), aspect="equal", facecolor=GROUND)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.set(xlim=(-0.13, 1.82), ylim=(-0.32, 1.07))
 
 
 def draw(throw: Throw, search: Search, path: Path) -> None:
-    import matplotlib
+    def fill(figure: Any) -> None:
+        panels = figure.subplots(1, 2)
+        for panel, name, shot in ((panels[0], "before", search.first), (panels[1], "after", search.best)):
+            title = f"{name}: {shot.millimetres:.1f} mm from the middle of the ring at t = {STEPS * DT:.2f} s"
+            draw_shot(panel, throw, shot, title)
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(13.2, 4.9), layout="constrained")
-    for panel, name, shot in ((axes[0], "before", search.first), (axes[1], "after", search.best)):
-        title = f"{name}: {shot.millimetres:.1f} mm from the middle of the ring at t = {STEPS * DT:.2f} s"
-        draw_shot(panel, throw, shot, title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, bbox_inches="tight", pad_inches=0.08)
-    plt.close(figure)
+    save_figure(path, fill, figsize=(13.2, 4.9))
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
@@ -417,9 +355,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         velocity, spin = ([round(x, 4) for x in t.tolist()] for t in (shot.velocity, shot.spin))
         print(f"{name} launch: velocity {velocity} m/s, spin {spin} rad/s, misses by {shot.millimetres:.1f} mm")
     if not options.no_picture:
-        path = options.out / "throw_bunny.png"
-        draw(throw, search, path)
-        print(f"picture: {path}")
+        draw(throw, search, options.out / "throw_bunny.png")
     passed = check(throw, search)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

@@ -1,0 +1,219 @@
+"""What the examples share: figures to put into scenes, an independent judge of penetration, and pictures."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import ipctk
+import numpy as np
+import pymeshfix  # type: ignore[import-untyped]
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+import diffsim as ds
+
+FloatArray = NDArray[np.float64]
+
+
+# ---- meshes ----------------------------------------------------------------------------------------------------------
+
+
+def load_figure(path: str | None, faces: int, size: float) -> Any:
+    """The mesh in a file, or the Stanford bunny: closed, decimated to `faces`, centred, its longest side `size` [m]."""
+    if path is None:
+        package = importlib.util.find_spec("pymeshfix")
+        assert package is not None and package.origin is not None
+        path = str(Path(package.origin).parent / "examples" / "StanfordBunny.ply")
+    scanned: Any = trimesh.load(path, force="mesh")
+    repaired = pymeshfix.MeshFix(scanned.vertices, scanned.faces)
+    repaired.repair()
+    mesh: Any = trimesh.Trimesh(repaired.points, repaired.faces)
+    if len(mesh.faces) > faces:
+        mesh = mesh.simplify_quadric_decimation(face_count=faces)
+    if not mesh.is_watertight:
+        raise ValueError(f"{path}: the decimated mesh is not closed")
+    mesh.apply_translation(-mesh.center_mass)
+    mesh.apply_scale(size / mesh.extents.max())
+    return mesh
+
+
+# ---- checks ----------------------------------------------------------------------------------------------------------
+
+
+def report(results: Iterable[tuple[str, bool]]) -> bool:
+    """Print what must hold and whether it does."""
+    passed = True
+    for text, holds in results:
+        print(f"{'ok  ' if holds else 'FAIL'}  {text}")
+        passed = passed and holds
+    return passed
+
+
+class Judge:
+    """Does anything intersect? By ipctk on the bare meshes, and numpy for spheres and the ground."""
+
+    def __init__(self, scene: ds.Scene, sim: ds.Simulator) -> None:
+        p = self._packed = scene.pack(sim.thickness)
+        self._sim = sim
+        names = [*p.names, *p.cloth_names]
+        vertex_ends = np.cumsum([*p.vertex_count, *p.node_count])
+        self.names = names
+        self._vertices = [slice(end - n, end) for end, n in zip(vertex_ends, [*p.vertex_count, *p.node_count])]
+        body_faces = np.split(p.faces, np.cumsum(p.face_count)[:-1]) if len(p.face_count) else []
+        cloth_faces = np.split(p.triangles, np.cumsum(p.triangle_count)[:-1]) if len(p.triangle_count) else []
+        # Faces of bodies count from the body's first vertex, triangles of cloths from the cloth's first node.
+        self._faces = [f + v.start for f, v in zip([*body_faces, *cloth_faces], self._vertices)]
+        faces = np.concatenate(self._faces)
+        self._owner = np.repeat(np.arange(len(names)), [len(f) for f in self._faces])
+        self._mesh = ipctk.CollisionMesh(np.zeros((vertex_ends[-1], 3)), ipctk.edges(faces), faces)
+        self._all_faces = faces
+        self._spheres = [i for i, n in enumerate(p.vertex_count) if n == 1]
+        self._movable = [i for i in range(len(names)) if i >= len(p.names) or p.kind[i] == 0]
+
+    def problems(self, state: ds.State) -> list[str]:
+        """What is wrong with a state, in words; empty if all is well."""
+        with torch.no_grad():
+            x = self._sim.vertices(state).numpy()
+        p, found = self._packed, []
+        if ipctk.has_intersections(self._mesh, x):
+            found.append("ipctk: surfaces cross")
+        if p.has_ground:
+            low = [name for name, v in zip(self.names, self._vertices) if x[v, 2].min() < p.ground_height]
+            found += [f"{self.names[i]} is in the ground" for i in self._movable if self.names[i] in low]
+        for i in self._spheres:
+            distance = self.sphere_distance(i, state)
+            # The margin is the radius; with the thickness of what it touches there is more room than this.
+            if distance < 0.0:
+                found.append(f"{self.names[i]} is {-distance:g} m deep in a surface")
+        return found
+
+    def count(self, states: Iterable[ds.State]) -> list[str]:
+        """The problems of all states, each with its step."""
+        return [f"{problem}, step {step}" for step, state in enumerate(states, 1) for problem in self.problems(state)]
+
+    def sphere_distance(self, sphere: int, state: ds.State) -> float:
+        """From the surface of a sphere to the nearest bare triangle [m]."""
+        with torch.no_grad():
+            x = self._sim.vertices(state).numpy()
+        triangles = x[self._all_faces]
+        centre = x[self._vertices[sphere]][0]
+        return float(point_triangle_distance(centre, triangles).min() - self._packed.margin[sphere])
+
+
+def point_triangle_distance(point: FloatArray, triangles: FloatArray) -> FloatArray:
+    """Distance of one point from each triangle, shapes (3,) and (n, 3, 3) [m]."""
+    a, b, c = triangles.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    inside = np.min([(np.cross(q - p, point - p) * normal).sum(1) for p, q in ((a, b), (b, c), (c, a))], axis=0) >= 0.0
+    to_edges = []
+    for p, q in ((a, b), (b, c), (c, a)):
+        along = np.clip(((point - p) * (q - p)).sum(1) / ((q - p) ** 2).sum(1), 0.0, 1.0)
+        to_edges.append(np.linalg.norm(p + along[:, None] * (q - p) - point, axis=1))
+    return np.asarray(np.where(inside, np.abs(((point - a) * normal).sum(1)), np.min(to_edges, axis=0)))
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+LIGHT = np.array([-0.35, -0.55, 1.0]) / np.linalg.norm([-0.35, -0.55, 1.0])
+GROUND, SHADOW = np.array([0.955, 0.955, 0.965]), np.array([0.86, 0.86, 0.885])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Orthographic, looking at the origin from these angles [degrees]."""
+
+    azimuth: float
+    elevation: float
+
+    def project(self, points: Any) -> Any:
+        """Points to (right, up, towards the camera)."""
+        ca, sa, ce, se = (f(math.radians(x)) for x in (self.azimuth, self.elevation) for f in (math.cos, math.sin))
+        view = np.array([[-sa, ca, 0.0], [-ca * se, -sa * se, ce], [ca * ce, sa * ce, se]])
+        return np.asarray(points) @ view.T
+
+
+@dataclass(frozen=True)
+class Item:
+    """A mesh to draw. Cloth (`two_sided`) is seen from both sides; whatever else is closed."""
+
+    mesh: Any
+    color: Sequence[float]
+    alpha: float = 1.0
+    two_sided: bool = False
+    edges: float = 0.0  # width of the lines between triangles, 0 for none
+
+
+def draw_items(axes: Any, items: Sequence[Item], camera: Camera, shadows: bool = True, largest: float = 0.04) -> None:
+    """Triangles of all meshes, flat shaded, far ones first; triangles longer than `largest` [m] are split for that."""
+    from matplotlib.collections import PolyCollection
+
+    subdivide: Any = trimesh.remesh.subdivide_to_size
+    triangles: list[Any] = []
+    colors: list[Any] = []
+    lines: list[Any] = []
+    for item in items:
+        mesh = item.mesh
+        if shadows:
+            fall = mesh.vertices - mesh.vertices[:, 2:] * LIGHT / LIGHT[2]
+            axes.add_collection(
+                PolyCollection(camera.project(fall)[mesh.faces][..., :2], facecolors=SHADOW, edgecolors=SHADOW, lw=0.3)
+            )
+        vertices, faces = (mesh.vertices, mesh.faces)
+        if not item.two_sided:
+            vertices, faces = subdivide(vertices, faces, largest)
+        corners = vertices[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        facing = camera.project(normals)[:, 2]
+        if item.two_sided:
+            normals[facing < 0.0] *= -1.0
+        brightness = 0.45 + 0.4 * np.clip(normals @ LIGHT, 0.0, 1.0) + 0.15 * np.clip(normals[:, 2], 0.0, 1.0)
+        visible = np.ones(len(faces), bool) if item.two_sided else facing > 0.0
+        shade = np.clip(brightness[visible, None] * np.asarray(item.color)[:3] * 1.08, 0.0, 1.0)
+        alphas = np.full((len(shade), 1), item.alpha)
+        triangles.append(camera.project(corners)[visible])
+        colors.append(np.concatenate([shade, alphas], axis=1))
+        line = np.concatenate([shade * (0.75 if item.edges else 1.0), alphas], axis=1)
+        lines.append(line if item.edges or item.alpha == 1.0 else np.concatenate([shade, 0.0 * alphas], axis=1))
+    triangle, color, line = np.concatenate(triangles), np.concatenate(colors), np.concatenate(lines)
+    order: Any = np.argsort(triangle[..., 2].mean(axis=1), kind="stable")
+    axes.add_collection(
+        PolyCollection(triangle[order][..., :2], facecolors=color[order], edgecolors=line[order], lw=0.25, zorder=2)
+    )
+    flat = triangle[..., :2].reshape(-1, 2)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    pad = 0.06 * (high - low).max()
+    axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad), aspect="equal", facecolor=GROUND)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def ball_mesh(radius: float, centre: Any) -> Any:
+    """For pictures: spheres have no mesh of their own."""
+    mesh: Any = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    mesh.apply_translation(np.asarray(centre))
+    return mesh
+
+
+def save_figure(path: Path, draw: Callable[[Any], None], **layout: Any) -> None:
+    """Make a figure, let `draw(figure)` fill it, write it."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(layout="constrained", **layout)
+    draw(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, bbox_inches="tight", pad_inches=0.08)
+    plt.close(figure)
+    print(f"picture: {path}")
