@@ -1,4 +1,5 @@
 # make demo       throw the bunny (examples/throw_bunny.py)
+# make examples   all examples, each of which checks itself; pictures in out/
 # make test       C++ and Python tests, the latter against the installed package
 # make sanitize   C++ tests in a Debug build with address and undefined-behaviour sanitizers
 # make lint       formatting, lint, types
@@ -25,11 +26,14 @@ SOURCES := pyproject.toml CMakeLists.txt \
            $(shell find csrc diffsim -type f ! -path '*/__pycache__/*' ! -name '_core*.so')
 CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')
 
-.PHONY: demo test test-cpp test-python sanitize lint format bench clean
+.PHONY: demo examples test test-cpp test-python sanitize lint format bench clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.with-examples
 	$(BIN)/python examples/throw_bunny.py
+
+examples: $(VENV)/.with-examples
+	@for script in $(sort $(wildcard examples/[a-z]*.py)); do echo $$script; $(BIN)/python $$script || exit 1; done
 
 test: test-cpp test-python
 

@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+import diffsim as ds
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 pytest.importorskip("pymeshfix", reason="the examples' packages: pip install .[examples]")
+sys.path.insert(0, str(EXAMPLES))  # as Python does for a script: they share _stage.py
 
 
 def load(name: str) -> ModuleType:
@@ -73,3 +76,84 @@ def test_throw_bunny_judge_sees_what_overlaps(bunny: ModuleType) -> None:
         (found,) = judge.penetrations(at_rest.replace(position=position))
         assert "bunny" in found
         assert partner in found
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "holds"),
+    [
+        ("lift_figurines", ["--quick"], 9),
+        ("dominoes", [], 7),
+        ("trampoline", ["--quick"], 7),
+        ("hanging_cloth", [], 10),
+    ],
+)
+def test_cloth_example_passes(
+    name: str, arguments: list[str], holds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "trampoline" and importlib.util.find_spec("mujoco") is not None:
+        holds += 1
+    assert load(name).main([*arguments, "--out", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "FAIL" not in output
+    assert output.count("ok  ") == holds
+    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "fails"),
+    [
+        ("dominoes", ["--no-sills", "--duration", "1.0"], ("dominoes fall", "the last domino does not reach")),
+        ("dominoes", ["--missing", "3", "--duration", "1.0"], ("dominoes fall", "the last domino does not reach")),
+        ("trampoline", ["--quick", "--dt", "0.04"], ("comes up to",)),  # such steps take its energy away
+    ],
+)
+def test_cloth_example_fails_where_it_should(
+    name: str, arguments: list[str], fails: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert load(name).main([*arguments, "--no-picture"]) == 1
+    wrong = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL ")]
+    for text in fails:
+        assert any(text in line for line in wrong), wrong
+
+
+def test_trampoline_leaves_mujoco_out_where_it_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trampoline = load("trampoline")
+    monkeypatch.setattr(trampoline.importlib.util, "find_spec", lambda name: None)
+    assert trampoline.peers(5, 0.01, 0.0, 0.1) == []
+    assert "mujoco is not installed" in capsys.readouterr().out
+
+
+def test_judge_of_the_cloth_examples_sees_what_overlaps() -> None:
+    trampoline, stage = load("trampoline"), load("_stage")
+    scene = trampoline.build_scene(5, 0.0)
+    sim = ds.Simulator(scene, dt=0.01)
+    judge, state = stage.Judge(scene, sim), sim.initial_state()
+    assert judge.problems(state) == []
+    low = state.position.clone()
+    low[0, 2] = trampoline.HEIGHT + 0.9 * trampoline.RADIUS
+    (found,) = judge.problems(state.replace(position=low))
+    assert "ball is 0.008 m deep" in found
+    folded = state.node_position.clone()
+    folded[0] = folded[24] + torch.tensor(
+        [-0.1, -0.05, 0.1], dtype=torch.float64
+    )  # corner over, and through, the far one
+    folded[1] = folded[18] - torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
+    assert judge.problems(state.replace(node_position=folded)) == ["ipctk: surfaces cross"]
+
+
+def test_judge_of_the_cloth_examples_sees_bodies_in_cloth_and_ground() -> None:
+    dominoes, stage = load("dominoes"), load("_stage")
+    scene = dominoes.build_scene()
+    sim = ds.Simulator(scene, dt=0.01)
+    judge, state = stage.Judge(scene, sim), sim.initial_state()
+    assert judge.problems(state) == []
+    for body, place, text in (
+        (0, (-0.1, 0.0, dominoes.BAR), "surfaces cross"),  # through the cloth
+        (0, tuple((state.position[1] + 0.01).tolist()), "surfaces cross"),  # through its neighbour
+        (3, (1.0, 0.0, 0.05), "domino 3 is in the ground"),
+    ):
+        position = state.position.clone()
+        position[body] = torch.tensor(place, dtype=torch.float64)
+        assert any(text in found for found in judge.problems(state.replace(position=position)))
