@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from . import _core
@@ -283,6 +284,31 @@ def _unfold_like(
     return grad if batch is None or not shared else grad.sum(1 + time)
 
 
+_INPUT_NAMES = (
+    "state.position",
+    "state.orientation",
+    "state.velocity",
+    "state.angular_velocity",
+    "control.force",
+    "control.torque",
+    "control.body_velocity",
+    "control.body_angular_velocity",
+    "mass",
+    "inertia",
+    "gravity",
+)
+
+
+def _refuse_tangents(inputs: tuple[Tensor | None, ...]) -> None:
+    """Inside a dual level of forward-mode AD. The shortcuts past autograd would drop tangents silently."""
+    for name, t in zip(_INPUT_NAMES, inputs):
+        if t is not None and forward_ad.unpack_dual(t).tangent is not None:
+            raise NotImplementedError(
+                f"diffsim: {name} carries a tangent, but there is no forward-mode AD through a step; use reverse mode"
+                " (backward, torch.func.vjp, jacrev)"
+            )
+
+
 _plain_apply = super(torch.autograd.Function, _Rollout).apply  # without inspect.signature, three quarters of the cost
 
 
@@ -363,6 +389,8 @@ def rollout(
         cloth_bend,
         cloth_damping,
     )
+    if forward_ad._current_level >= 0:
+        _refuse_tangents(inputs)
     if not torch.is_grad_enabled():
         call.keep_tape = False
     outputs: OptionalTensors

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vjp, vmap
 
@@ -364,3 +365,28 @@ def test_hidden_inputs_are_recorded_under_vmap(sim: ds.Simulator, calls: Calls) 
     assert (calls.forward, calls.backward) == (1, 1)
     assert velocity.grad is not None
     assert velocity.grad.any()
+
+
+# ---- forward-mode AD -------------------------------------------------------------------------------------------------
+
+
+def test_tangents_are_refused_by_name() -> None:
+    scene = ds.Scene()
+    scene.add_sphere(0.1, density=1000.0, position=(0, 0, 1))
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    ones = torch.ones_like(state.velocity)
+    with forward_ad.dual_level():
+        assert torch.equal(sim(state).position, sim(state).position)  # nothing carries a tangent here
+        dual = state.replace(velocity=forward_ad.make_dual(state.velocity, ones))
+        for call in (lambda: sim(dual), lambda: sim.rollout(dual, None, 3)):
+            with pytest.raises(NotImplementedError, match=r"state\.velocity carries a tangent"):
+                call()
+        force = forward_ad.make_dual(torch.zeros(1, 3, dtype=torch.float64), ones)
+        with pytest.raises(NotImplementedError, match=r"control\.force carries a tangent"):
+            sim(state, ds.Control(force=force))
+        gravity = forward_ad.make_dual(sim.gravity.detach(), ones[0])
+        with pytest.raises(NotImplementedError, match="gravity carries a tangent"):
+            torch.func.functional_call(sim, {"gravity": gravity}, (state,))
+    with pytest.raises(NotImplementedError, match="carries a tangent"):
+        torch.func.jvp(lambda v: sim(state.replace(velocity=v)).position, (state.velocity,), (ones,))
