@@ -13,7 +13,16 @@ import torch
 from torch import Tensor, nn
 
 from . import _core
-from ._check import CLOTH_PARAMETERS, PARAMETERS, check_choice, check_count, check_instance, check_number
+from ._check import (
+    CLOTH_PARAMETERS,
+    PARAMETERS,
+    check_choice,
+    check_count,
+    check_float_tensor,
+    check_instance,
+    check_number,
+    check_shape,
+)
 from ._cloth_energy import cloth_elements
 from ._inputs import Controls, Inputs, checked_inputs
 from ._measurements import Measurements
@@ -157,6 +166,7 @@ class Simulator(Measurements):
         self._node_count = len(p.node_rest)
         self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
         self._parameter_shapes = torch.Size((n,)), torch.Size((n, 3, 3)), torch.Size((3,))
+        self._object_shape = p.friction.shape
         self._separated: tuple[np.ndarray, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -388,10 +398,12 @@ class Simulator(Measurements):
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
     def _check_unused_parameters(self) -> None:
-        if torch._C._are_functorch_transforms_active():
-            return  # values cannot be looked at there
         for name in ("friction", "restitution"):
-            values = getattr(self, name).numpy(force=True)
+            tensor = getattr(self, name)
+            if type(tensor) is not nn.Parameter or tensor.shape != self._object_shape:  # exchanged for this call
+                check_shape("Simulator", name, check_float_tensor("Simulator", name, tensor), self._object_shape, None)
+            transforms = torch._C._are_functorch_transforms_active()
+            values = _unwrapped_values(tensor) if transforms else tensor.numpy(force=True)
             if values.tobytes().strip(b"\0") and values.any():  # .any() alone takes half as long as a small step
                 raise NotImplementedError(f"Simulator: {name} must be 0, contact has none in this version yet")
 
@@ -450,6 +462,14 @@ class Simulator(Measurements):
         stage("cloth", no_cloth)
         stage("cloth contact", no_cloth)
         return runs, left_out
+
+
+def _unwrapped_values(tensor: Tensor) -> np.ndarray:
+    """What torch.func's transforms have wrapped: all values, mapped axes of vmap among the axes."""
+    while torch._C._functorch.is_functorch_wrapped_tensor(tensor):
+        tensor = torch._C._functorch.get_unwrapped(tensor)
+    with torch._C._DisableFuncTorch():  # or they would wrap what is done here, too
+        return tensor.numpy(force=True)
 
 
 def _result(outputs: tuple[Tensor | None, ...], state: State) -> State:

@@ -397,3 +397,34 @@ def test_repr_names_what_runs_and_what_does_not() -> None:
     assert left_out.startswith("leaves out: kinematic motion (no kinematic body), body-body contact (one body), ")
     assert "cloth" in left_out
     assert "body-body contact" in repr(ds.Simulator(make_scene(), dt=0.01)).splitlines()[1]
+
+
+# ---- nothing is ignored silently -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["friction", "restitution"])
+@pytest.mark.parametrize("transform", ["none", "vmap", "grad", "vmap of grad", "jacrev"])
+def test_unused_parameters_are_looked_at_under_transforms(name: str, transform: str) -> None:
+    sim = ds.Simulator(make_scene(), dt=0.01)
+    state = sim.initial_state()
+
+    def height(value: Tensor) -> Tensor:
+        return torch.func.functional_call(sim, {name: value}, (state,)).position[:, 2].sum()
+
+    function, batched = {
+        "none": (height, False),
+        "vmap": (torch.func.vmap(height), True),
+        "grad": (torch.func.grad(height), False),
+        "vmap of grad": (torch.func.vmap(torch.func.grad(height)), True),
+        "jacrev": (torch.func.jacrev(height), False),
+    }[transform]
+    size = len(getattr(sim, name))
+
+    def values(value: float, count: int) -> Tensor:
+        return torch.full((2, count) if batched else (count,), value, dtype=torch.float64)
+
+    assert bool(function(values(0.0, size)).isfinite().all())
+    with pytest.raises(NotImplementedError, match=f"{name} must be 0"):
+        function(values(0.5, size))
+    with pytest.raises(ValueError, match=rf"{name} must have shape \({size},\)"):
+        function(values(0.0, size + 4))
