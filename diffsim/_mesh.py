@@ -101,9 +101,14 @@ def _read_file(path: str, where: str) -> tuple[FloatArray, NDArrayInt]:
         raise FileNotFoundError(f"{where}: mesh file not found: {path}")
     import trimesh  # lazily: importing diffsim must not cost what reading files costs
 
-    # process=False: trimesh would merge within an absolute 1e-8, whatever the size of the object. maintain_order: it
-    # would split and sort the vertices of an OBJ file with texture coordinates.
-    loaded = trimesh.load_scene(path, process=False, maintain_order=True).to_mesh()
+    try:
+        # process=False: trimesh would merge within an absolute 1e-8, whatever the size of the object. maintain_order: it
+        # would split and sort the vertices of an OBJ file with texture coordinates.
+        loaded = trimesh.load_scene(path, process=False, maintain_order=True).to_mesh()
+    except (NotImplementedError, ValueError) as error:  # an extension it does not know; a broken file
+        raise ValueError(f"{where}: mesh file {path} could not be read: {error}") from error
+    if len(loaded.faces) == 0:
+        raise ValueError(f"{where}: mesh file {path} has no faces")
     return _read_arrays(loaded.vertices, loaded.faces, where)
 
 

@@ -468,3 +468,17 @@ def test_shared_scenes_take_their_size() -> None:
     assert scenes.falling_cubes(1).pack().vertices.shape == (8, 3)
     free = scenes.box_on_box(fixed=False)
     free.validate(free.pack())
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("mesh.xyzq", "hello", r"body 'x': mesh file .*mesh\.xyzq could not be read: .*xyzq"),
+        ("mesh.obj", "v 0 0 0\nv 1 0 0\n", r"body 'x': mesh file .*mesh\.obj has no faces"),
+        ("mesh.stl", "", r"body 'x': mesh file .*mesh\.stl has no faces"),
+    ],
+)
+def test_files_that_are_no_mesh_are_refused_by_name(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        Scene().add_body(tmp_path / name, density=1.0, name="x")
