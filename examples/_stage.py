@@ -24,18 +24,22 @@ FloatArray = NDArray[np.float64]
 # ---- meshes ----------------------------------------------------------------------------------------------------------
 
 
+def repaired(mesh: Any) -> Any:
+    """The mesh, closed."""
+    fixed = pymeshfix.MeshFix(mesh.vertices, mesh.faces)
+    fixed.repair()
+    return trimesh.Trimesh(fixed.points, fixed.faces)
+
+
 def load_figure(path: str | None, faces: int, size: float) -> Any:
     """The mesh in a file, or the Stanford bunny: closed, decimated to `faces`, centred, its longest side `size` [m]."""
     if path is None:
         package = importlib.util.find_spec("pymeshfix")
         assert package is not None and package.origin is not None
         path = str(Path(package.origin).parent / "examples" / "StanfordBunny.ply")
-    scanned: Any = trimesh.load(path, force="mesh")
-    repaired = pymeshfix.MeshFix(scanned.vertices, scanned.faces)
-    repaired.repair()
-    mesh: Any = trimesh.Trimesh(repaired.points, repaired.faces)
+    mesh: Any = repaired(trimesh.load(path, force="mesh"))
     if len(mesh.faces) > faces:
-        mesh = mesh.simplify_quadric_decimation(face_count=faces)
+        mesh = repaired(mesh.simplify_quadric_decimation(face_count=faces))  # which may open it
     if not mesh.is_watertight:
         raise ValueError(f"{path}: the decimated mesh is not closed")
     mesh.apply_translation(-mesh.center_mass)

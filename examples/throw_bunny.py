@@ -347,7 +347,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
-    mesh = load_mesh(options.mesh)
+    try:
+        mesh = load_mesh(options.mesh)
+    except (OSError, ValueError, NotImplementedError) as error:
+        parser.error(f"--mesh: {error}")
     throw = Throw(mesh)
     print(f"{len(mesh.faces)} faces, {float(throw.sim.mass[throw.bunny]):.3f} kg; {STEPS} steps of {DT:g} s")
     search = optimise(throw, options.iterations)

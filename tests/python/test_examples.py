@@ -78,6 +78,25 @@ def test_throw_bunny_judge_sees_what_overlaps(bunny: ModuleType) -> None:
         assert partner in found
 
 
+def test_throw_bunny_closes_what_decimation_opens(bunny: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    trimesh = pytest.importorskip("trimesh")
+
+    def decimated(mesh: object, face_count: int) -> object:
+        whole = trimesh.creation.icosphere(subdivisions=3)
+        return trimesh.Trimesh(whole.vertices, whole.faces[1:])
+
+    monkeypatch.setattr(trimesh.Trimesh, "simplify_quadric_decimation", decimated)
+    assert bunny.load_mesh().is_watertight
+
+
+def test_throw_bunny_says_in_a_line_that_there_is_no_such_mesh(
+    bunny: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        bunny.main(["--mesh", "/nope.ply"])
+    assert "error: --mesh: " in capsys.readouterr().err.splitlines()[-1]
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "holds"),
     [
