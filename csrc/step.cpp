@@ -496,6 +496,11 @@ private:
             m_info.max_compression = std::max(m_info.max_compression, outcome.max_compression);
             m_info.signature = mix(m_info.signature, outcome.signature);
         }
+        for (int i : m.dynamic) {
+            if (m.rotation[i].substeps > 0) continue;
+            m_info.converged = false;
+            if (m_info.status == ZoneStatus::converged) m_info.status = ZoneStatus::spinning;
+        }
         SceneState result = m_state;
         for (int i = 0; i < m_model.body_count(); ++i) {
             BodyState& end = result.bodies[i];
@@ -583,6 +588,7 @@ ZoneBody moving_body(
     body.mass = parameters.mass[id];
     body.target << rotation.rotation, dt * free_velocity(id, state, control, parameters, dt);
     body.warm << dt * state.angular_velocity, dt * state.velocity;
+    if (rotation.substeps == 0) body.warm.head<3>().setZero();  // it is held
     return body;
 }
 

@@ -36,6 +36,7 @@ __all__ = ["Simulator"]
 _MENDS = {
     "max_iterations reached": "try a larger max_iterations or a smaller dt",
     "no step lowers the energy": "try a smaller dt or a larger tolerance",
+    "a body spins too fast": "check angular velocities and torques; a smaller dt allows for faster ones",
     "a driven body is blocked: something is squeezed": (
         "check what the kinematic bodies squeeze and how far they are driven, or try a smaller dt"
     ),

@@ -325,6 +325,8 @@ const char* failure_text(ZoneStatus status) {
             return "max_iterations reached";
         case ZoneStatus::no_descent:
             return "no step lowers the energy";
+        case ZoneStatus::spinning:
+            return "a body spins too fast";
         case ZoneStatus::blocked:
             return "a driven body is blocked: something is squeezed";
         case ZoneStatus::bad_start:

@@ -8,6 +8,7 @@ enum class ZoneStatus {
     converged,
     too_many_iterations,
     no_descent,  ///< the line search found no lower energy
+    spinning,    ///< never of a zone: a body turns further than its free motion can be solved for
     blocked,     ///< a driven body cannot reach its target: something is squeezed
     bad_start,   ///< objects at or below their pole at the start of the step
 };

@@ -3,6 +3,7 @@
 #include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
+#include <cassert>
 #include <cmath>
 #include <vector>
 
@@ -48,7 +49,8 @@ Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, c
         if (norm <= 0.5 * kEpsilon * momentum.norm()) break;
         w -= momentum_jacobian(trial, dt).partialPivLu().solve(residual);
     }
-    best.converged = best_residual <= 16.0 * kEpsilon * scale && dt * best.angular_velocity.norm() < 3.0;
+    best.converged = std::isfinite(best_residual) && best_residual <= 16.0 * kEpsilon * scale &&
+                     dt * best.angular_velocity.norm() < 3.0;
     return best;
 }
 
@@ -93,7 +95,7 @@ FreeRotation free_rotation(
         if (substeps.empty()) continue;
         return {substeps.back().angular_velocity, log_rotation(substeps.back().R1 * R0.transpose()), count};
     }
-    return {guess, log_rotation(exp_rotation(dt * guess)), 0};
+    return {angular_velocity, Vec3::Zero(), 0};
 }
 
 Vec3 inertia_rotation_gradient(const Mat3& inertia_world, const Vec3& w, const Vec3& covector) {
@@ -109,6 +111,10 @@ FreeRotationGradient free_rotation_backward(
     const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt,
     const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation) {
     FreeRotationGradient grad;
+    if (result.substeps == 0) {  // held
+        grad.angular_velocity = grad_angular_velocity;
+        return grad;
+    }
     const Mat3 inertia0 = R0 * inertia_body * R0.transpose();
     const Vec3 momentum = inertia0 * angular_velocity + dt * torque;
     std::vector<Substep> substeps;
@@ -122,7 +128,7 @@ FreeRotationGradient free_rotation_backward(
         const Vec3 guess = initial_guess(inertia0, angular_velocity, torque, dt);
         substeps = solve_substeps(R0, guess, momentum, inertia_body, dt, result.substeps);
     }
-    if (substeps.empty()) return grad;  // the forward did not converge either and said so
+    assert(!substeps.empty());  // as in the forward
 
     const double dt_sub = dt / static_cast<double>(substeps.size());
     Vec3 grad_w = grad_angular_velocity;

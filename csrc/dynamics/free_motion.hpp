@@ -8,7 +8,7 @@ namespace diffsim {
 struct FreeRotation {
     Vec3 angular_velocity;  ///< at the end of the step [rad/s]
     Vec3 rotation;          ///< rotation vector of the whole step, R1 = Exp(rotation) R0 [rad]
-    int substeps = 1;
+    int substeps = 1;       ///< 0: too many would be needed; the body keeps its orientation and angular velocity
 };
 
 /// Solve I(R1) w1 = I(R0) w0 + dt torque with R1 = Exp(dt w1) R0 and I(R) = R I_b Rᵀ, so that angular

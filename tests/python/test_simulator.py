@@ -428,3 +428,27 @@ def test_unused_parameters_are_looked_at_under_transforms(name: str, transform: 
         function(values(0.5, size))
     with pytest.raises(ValueError, match=rf"{name} must have shape \({size},\)"):
         function(values(0.0, size + 4))
+
+
+@pytest.mark.parametrize("on_ground", [False, True])
+@pytest.mark.parametrize("spin", [1e9, 1e200])
+def test_a_spin_that_cannot_be_solved_for_is_told(spin: float, on_ground: bool) -> None:
+    scene = ds.Scene()
+    if on_ground:
+        scene.add_ground()
+    spins = (0.3 * spin, spin, 0.2 * spin)
+    scene.add_body(ds.shapes.box((1.0, 0.6, 0.3)), density=500.0, position=(0, 0, 0.151), angular_velocity=spins)
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    leaves = [getattr(state, n).requires_grad_() for n in ("position", "orientation", "velocity", "angular_velocity")]
+    with pytest.warns(ds.ConvergenceWarning, match="a body spins too fast.*angular velocities"):
+        after = sim(state)
+    assert sim.info is not None
+    assert not sim.info.converged
+    for tensor in (after.position, after.orientation, after.velocity, after.angular_velocity):
+        assert bool(tensor.isfinite().all())
+    total = after.position.sum() + after.orientation.sum() + after.angular_velocity.sum()
+    gradients = torch.autograd.grad(total, leaves)
+    assert all(bool(g.isfinite().all()) for g in gradients)
+    if not on_ground:
+        assert gradients[3].tolist() == [[1.0, 1.0, 1.0]]  # it goes on as it spins

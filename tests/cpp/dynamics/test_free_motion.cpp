@@ -207,3 +207,20 @@ TEST(parts_of_the_inertia_term) {
     const double by_inertia = inertia_body_gradient(R, w, covector).cwiseProduct(change).sum();
     CHECK_NEAR(by_inertia, covector.dot(R * change * R.transpose() * w), 1e-14);
 }
+
+TEST(a_spin_beyond_all_substeps_is_held_and_says_so) {
+    const Mat3 inertia = Vec3(1.0, 2.0, 2.5).asDiagonal();
+    for (const double spin : {1e9, 1e100, 1e200, 1e300}) {
+        NOTE(spin);
+        const Vec3 w0 = spin * Vec3(0.3, 1.0, 0.2);
+        const FreeRotation result = free_rotation(Mat3::Identity(), w0, Vec3::Zero(), inertia, 0.01);
+        CHECK(result.substeps == 0);
+        CHECK(result.angular_velocity == w0);
+        CHECK(result.rotation.isZero(0.0));
+        const FreeRotationGradient grad = free_rotation_backward(
+            Mat3::Identity(), w0, Vec3::Zero(), inertia, 0.01, result, Vec3(1, 2, 3), Vec3(4, 5, 6));
+        CHECK(grad.angular_velocity == Vec3(1, 2, 3));
+        CHECK(grad.torque.isZero(0.0));
+        CHECK(grad.orientation.isZero(0.0));
+    }
+}
