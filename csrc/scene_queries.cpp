@@ -2,12 +2,48 @@
 
 #include <Eigen/LU>
 #include <algorithm>
+#include <cstdio>
+#include <stdexcept>
+#include <string>
 
 #include "contact/separation.hpp"
 #include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
+namespace {
+
+constexpr double kGoodEnough =
+    0.01;  // of the contact's depth that may be missing after separation: a step can do with it
+
+std::string number(double value) {
+    char text[32];
+    std::snprintf(text, sizeof text, "%g", value);
+    return text;
+}
+
+[[noreturn]] void refuse_separation(
+    const Model& model, const std::string& what, int a, int b, const std::string& mend) {
+    throw std::invalid_argument(what + " '" + model.name(a) + "' and '" + model.name(b) + "'" + mend);
+}
+
+void check_separation(const Model& model, const Separation& separation, const SceneState& result) {
+    const CrossingObjects crossing = find_crossing(model, result);
+    if (crossing.a != kNobody)
+        refuse_separation(
+            model, "cannot separate", crossing.a, crossing.b,
+            ": their meshes cross; move them apart by hand until they touch at most");
+    if (separation.complete || separation.lack <= kGoodEnough) return;
+    const int a = separation.worst.object_a, b = separation.worst.object_b;
+    refuse_separation(
+        model, "there is no room between", a, b,
+        " for the thickness: their meshes are " + number(separation.distance) + " m apart where they need " +
+            number(separation.rest) + " m, and moving them brings them too near to something else; they lack " +
+            number(separation.rest - separation.distance) + " m. Give a smaller thickness (it is " +
+            number(model.thickness) + " m), or make room");
+}
+
+}  // namespace
 
 SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state) {
@@ -53,6 +89,7 @@ SceneState separate_state(
         if (turn.isIdentity(4.0 * kEpsilon)) continue;
         body.orientation = quaternion_multiply(exp_quaternion(log_rotation(turn)), body.orientation).normalized();
     }
+    check_separation(model, separation, result);
     return result;
 }
 

@@ -6,7 +6,8 @@
 /// Questions about a state that no step asks.
 namespace diffsim {
 
-/// The state with dynamic bodies that touch, or are nearer than they rest, moved apart (contact/separation.hpp).
+/// The state with dynamic bodies that touch, or are nearer than they rest, moved apart (contact/separation.hpp). Throws
+/// std::invalid_argument, naming the pair, where meshes cross or there is no room.
 SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state);
 

@@ -3,8 +3,10 @@
 #include <Eigen/LU>
 #include <algorithm>
 #include <chrono>
+#include <cstdio>
 #include <numeric>
 #include <stdexcept>
+#include <string>
 
 #include "math/rotation.hpp"
 
@@ -49,6 +51,12 @@ std::uint64_t mix(std::uint64_t hash, std::uint64_t value) {
 }
 
 std::uint64_t pack(int high, std::uint32_t low) { return (static_cast<std::uint64_t>(high) << 32) ^ low; }
+
+std::string number(double value) {
+    char text[32];
+    std::snprintf(text, sizeof text, "%g", value);
+    return text;
+}
 
 /// Bound on how far vertices leave the straight line between the ends of a turn.
 double sagitta(const Vec6& motion, double radius) {
@@ -374,8 +382,8 @@ private:
     [[noreturn]] void refuse_start(const ZoneContact& contact, double distance) const {
         throw PenetratingStart(
             "state: '" + m_model.name(contact.contact.object_a) + "' and '" + m_model.name(contact.contact.object_b) +
-            "' penetrate: their meshes are " + std::to_string(distance) + " m apart, where at rest they keep " +
-            std::to_string(contact.range.rest) + " m; move them apart, for instance with sim.separate(state)");
+            "' penetrate: their meshes are " + number(distance) + " m apart, where at rest they keep " +
+            number(contact.range.rest) + " m; move them apart, for instance with sim.separate(state)");
     }
 
     /// Bodies that were pushed out of the space reserved for them may have met others: such groups are joined, to be

@@ -83,6 +83,10 @@ class Measurements(nn.Module):
             differentiable.
         """
         self._check_state("min_distance", state)
+        self._refuse_transforms("min_distance")
+        if not state.position.numel() and not state.node_position.numel():  # nothing there, or no scene
+            nothing = torch.full(state.leading_shape, torch.inf, dtype=state.dtype)
+            return nothing if nothing.ndim else torch.inf
         found = self._for_each_scene(lambda *x: (_core.min_distance(self._model, *x)[0],), state)[0]
         return torch.from_numpy(found).to(state.dtype) if found.ndim else float(found)
 
@@ -148,9 +152,13 @@ class Measurements(nn.Module):
 
         For states made by hand. Velocities stay. To autograd the shift is a constant, as if nothing moved.
 
-        Raises: ValueError for a state of the wrong shape, or one whose objects are too deep in each other.
+        Raises: ValueError for a state of the wrong shape; for one whose meshes cross, or in which there is no room for
+            the thickness, naming the pair.
         """
         self._check_state("separate", state)
+        self._refuse_transforms("separate")
+        if not state.position.numel() and not state.node_position.numel():  # nothing there, or no scene
+            return state
 
         def changes(*placed: np.ndarray) -> tuple[np.ndarray, ...]:
             return tuple(after - before for after, before in zip(self._separated_from(*placed), placed, strict=True))
@@ -190,6 +198,14 @@ class Measurements(nn.Module):
             }
             state = state.replace(**flat)
         check_state(where, state, self._body_count, self._node_count)
+
+    @staticmethod
+    def _refuse_transforms(where: str) -> None:
+        if torch._C._are_functorch_transforms_active():
+            raise NotImplementedError(
+                f"{where}: cannot run inside a transform of torch.func (vmap, grad, ...); call it outside, where states"
+                " may have any leading axes"
+            )
 
     def _for_each_scene(self, function: Callable[..., Any], state: State) -> tuple[np.ndarray, ...]:
         """Stacks the results of function(position, orientation, node_position), run for every entry of the leading

@@ -79,7 +79,8 @@ class Simulator(Measurements):
             (`SolverError`).
         check: Whether to look for overlaps in the scene, and for parameter values this version does not know. Types and
             shapes are always checked.
-    Raises: TypeError, ValueError for what the message names, overlapping objects among it.
+    Raises: TypeError, ValueError for what the message names: overlapping objects, or objects that have no room to keep
+        `thickness` apart, among it.
     """
 
     friction: nn.Parameter
@@ -135,6 +136,8 @@ class Simulator(Measurements):
         self._info: Info | list[Any] | None = None  # a list of the core's, one per segment, until someone asks
         self._warned = False
         self._build()
+        if self._check:
+            self._separate_scene()
 
     def _build(self) -> None:
         """What is made from the packed scene and cannot be pickled."""
@@ -215,17 +218,23 @@ class Simulator(Measurements):
         Args:
             batch: Number of copies, along a new leading axis. Default: one state without it.
         Returns: New tensors of the parameters' dtype (float64, or float32 after ``sim.float()``).
+        Raises: ValueError where there is no room for the thickness.
         """
         p = self._packed
-        if self._separated is None:
-            self._separated = self._separated_from(p.position, p.orientation, p.node_position)
-        position, orientation, node_position = self._separated
+        position, orientation, node_position = self._separate_scene()
         arrays = position, orientation, p.velocity, p.angular_velocity, node_position, p.node_velocity
         tensors = [torch.from_numpy(a).to(self.mass.dtype) for a in arrays]
         if batch is not None:
             count = check_count("initial_state", "batch", batch)
             tensors = [t.expand(count, *t.shape) for t in tensors]
         return State(*(t.clone(memory_format=torch.contiguous_format) for t in tensors))
+
+    def _separate_scene(self) -> tuple[np.ndarray, ...]:
+        """Places of bodies and nodes of the scene, moved apart. Made once."""
+        if self._separated is None:
+            p = self._packed
+            self._separated = self._separated_from(p.position, p.orientation, p.node_position)
+        return self._separated
 
     # ---- stepping ----------------------------------------------------------------------------------------------------
 

@@ -90,6 +90,7 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
         std::vector<ImpactRow> rows;
         std::vector<int> row_contacts;
         bool complete = true;
+        result.lack = 0.0;
         for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
             const ZoneContact& contact = zone.contacts[k];
             ContactGeometry geometry = contact_geometry(
@@ -98,6 +99,13 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
             const double depth = contact.range.rest - contact.range.floor;
             if (!(geometry.distance < contact.range.rest - kAccepted * depth) || geometry.sine_sq == 0.0) continue;
             complete = false;
+            const double lack = (contact.range.rest - geometry.distance) / depth;
+            if (lack > result.lack) {
+                result.worst = contact.contact;
+                result.distance = geometry.distance;
+                result.rest = contact.range.rest;
+                result.lack = lack;
+            }
             const SignedGap gap = signed_gap(zone, contact, geometry, round >= kRoundsBeforeGuesses);
             if (!gap.valid) continue;
             geometry.normal = gap.normal;

@@ -190,3 +190,81 @@ def test_measurements_name_wrong_states(sim: ds.Simulator) -> None:
     for name in ("kinetic_energy", "potential_energy", "momentum", "angular_momentum", "min_distance", "vertices"):
         with pytest.raises(ValueError, match=rf"{name}: state.position must have shape \(2, 3\)"):
             getattr(sim, name)(wrong)
+
+
+# ---- what has no answer ----------------------------------------------------------------------------------------------
+
+
+def fitting(**options: Any) -> tuple[ds.Scene, dict[str, Any]]:
+    """A cube of 1 m exactly between two fixed ones."""
+    scene = ds.Scene()
+    for x in (-1.0, 1.0):
+        scene.add_body(ds.shapes.box(1.0), kind="static", position=(x, 0.0, 0.0), name=f"wall at {x:g}")
+    scene.add_body(ds.shapes.box(1.0), density=1.0, name="fit")
+    return scene, {"dt": 0.01, **options}
+
+
+def test_where_there_is_no_room_for_the_thickness_everything_says_so() -> None:
+    no_room = r"no room.*'fit' and 'wall at -?1'.* 0 m apart.* need 0\.001 m.*lack 0\.001 m.*smaller thickness"
+    scene, options = fitting()
+    with pytest.raises(ValueError, match=no_room):
+        ds.Simulator(scene, **options)
+    sim = ds.Simulator(scene, **options, check=False)
+    with pytest.raises(ValueError, match=no_room):
+        sim.initial_state()
+    position = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    with pytest.raises(ValueError, match=no_room):
+        sim.separate(ds.State(position))
+    with pytest.raises(ValueError, match=r"are 0 m apart, where at rest they keep 0\.001 m"):
+        sim(ds.State(position))
+
+
+def test_a_little_room_is_enough() -> None:
+    scene = ds.Scene()
+    for x in (-1.001, 1.001):
+        scene.add_body(ds.shapes.box(1.0), kind="static", position=(x, 0.0, 0.0))
+    scene.add_body(ds.shapes.box(1.0), density=1.0, position=(0.0009, 0.0, 0.0))
+    sim = ds.Simulator(scene, dt=0.01, thickness=1e-3)
+    assert sim.min_distance(sim.initial_state()) == pytest.approx(0.0, abs=1e-5)
+    sim(sim.initial_state())
+
+
+def test_meshes_that_cross_are_not_separated_silently() -> None:
+    scene = ds.Scene()
+    scene.add_body(ds.shapes.box(2.0), density=1.0, name="large", position=(5, 0, 0))
+    scene.add_body(ds.shapes.box(0.5), density=1.0, name="small")
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state()
+    state.position[0] = torch.tensor([1.1, 0.0, 0.0])
+    with pytest.raises(ValueError, match=r"'large' and 'small'.*meshes cross"):
+        sim.separate(state)
+
+
+def test_no_bodies_and_no_scenes_are_measured() -> None:
+    scene = ds.Scene()
+    scene.add_ground()
+    empty = ds.Simulator(scene, dt=0.01)
+    assert empty.min_distance(empty.initial_state()) == float("inf")
+    assert empty.min_distance(empty.initial_state(batch=3)).tolist() == [float("inf")] * 3  # type: ignore[union-attr]
+    assert empty.separate(empty.initial_state(batch=3)).position.shape == (3, 0, 3)
+    sim = ds.Simulator(make_scene(), dt=0.01)
+    none = sim.initial_state(batch=1)[:0]
+    assert none.position.shape == (0, 2, 3)
+    assert sim.min_distance(none).shape == (0,)  # type: ignore[union-attr]
+    assert sim.separate(none).position.shape == (0, 2, 3)
+
+
+def test_bodies_that_never_collide_have_no_distance() -> None:
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(ds.shapes.box(1.0), kind="static")
+    for x in (0.3, 0.4):
+        scene.add_body(ds.shapes.box(1.0), kind="kinematic", position=(x, 0.0, 0.3))
+    sim = ds.Simulator(scene, dt=0.01)
+    assert sim.min_distance(sim.initial_state()) == float("inf")
+
+
+@pytest.mark.parametrize("name", ["min_distance", "separate"])
+def test_transforms_are_refused_with_a_message(sim: ds.Simulator, name: str) -> None:
+    with pytest.raises(NotImplementedError, match=rf"{name}: cannot run inside a transform of torch\.func"):
+        torch.func.vmap(getattr(sim, name))(sim.initial_state(batch=2))
