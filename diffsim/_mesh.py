@@ -102,8 +102,8 @@ def _read_file(path: str, where: str) -> tuple[FloatArray, NDArrayInt]:
     import trimesh  # lazily: importing diffsim must not cost what reading files costs
 
     try:
-        # process=False: trimesh would merge within an absolute 1e-8, whatever the size of the object. maintain_order: it
-        # would split and sort the vertices of an OBJ file with texture coordinates.
+        # process=False: trimesh would merge within an absolute 1e-8, whatever the size of the object. maintain_order:
+        # it would split and sort the vertices of an OBJ file with texture coordinates.
         loaded = trimesh.load_scene(path, process=False, maintain_order=True).to_mesh()
     except (NotImplementedError, ValueError) as error:  # an extension it does not know; a broken file
         raise ValueError(f"{where}: mesh file {path} could not be read: {error}") from error

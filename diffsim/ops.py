@@ -12,6 +12,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from . import _core
+from ._check import CLOTH_PARAMETERS, CONTROL_FIELDS, PARAMETERS, STATE_FIELDS
 
 __all__ = ["ConvergenceWarning", "Info", "RolloutCall", "SolverError", "rollout"]
 
@@ -285,17 +286,10 @@ def _unfold_like(
 
 
 _INPUT_NAMES = (
-    "state.position",
-    "state.orientation",
-    "state.velocity",
-    "state.angular_velocity",
-    "control.force",
-    "control.torque",
-    "control.body_velocity",
-    "control.body_angular_velocity",
-    "mass",
-    "inertia",
-    "gravity",
+    *(f"state.{name}" for name in STATE_FIELDS),
+    *(f"control.{name}" for name in CONTROL_FIELDS),
+    *PARAMETERS,
+    *CLOTH_PARAMETERS,
 )
 
 
