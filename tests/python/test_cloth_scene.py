@@ -395,7 +395,9 @@ def test_what_touches_or_surrounds_is_accepted() -> None:
     scene.add_cloth(shapes.sheet(1.0, 6), position=(0.5, 0.5, 0.501))
     scene.add_cloth(shapes.icosphere(3.0, 2))  # a bag around everything
     scene.add_ground(height=-5.0)
-    scene.validate(scene.pack())
+    scene.validate(scene.pack())  # raises if it refuses
+    scene.add_cloth(shapes.sheet(1.0, 6), position=(0, 0, 0.4), name="deep")  # nearly the same, in the cube
+    assert "'deep'" in refusal(scene)
     folded, faces = shapes.sheet((1.0, 0.5), (5, 3))
     folded[folded[:, 0] > 0.2] = folded[folded[:, 0] > 0.2] * [-1.0, 1.0, 1.0] + [0.0, 0.0, 0.01]
     scene = Scene()
