@@ -270,9 +270,22 @@ SceneState end_state(const Tape& tape, int scene, int time) {
     return end;
 }
 
+/// What the backward of a rollout's step has to compute: earlier steps need the state's gradient whether asked for or not.
+GradientNeeds step_needs(const RolloutArrays<double>& wanted, int time) {
+    const auto any = [](const auto&... views) { return (views.present() || ...); };
+    GradientNeeds needs;
+    needs.place = time > 0 || any(wanted.position, wanted.orientation, wanted.velocity, wanted.angular_velocity,
+                                  wanted.node_position, wanted.node_velocity, wanted.body_velocity,
+                                  wanted.body_angular_velocity, wanted.node_drive);
+    needs.mass = any(wanted.mass, wanted.cloth_density);
+    needs.inertia = any(wanted.inertia);
+    needs.material = any(wanted.cloth_stretch, wanted.cloth_shear, wanted.cloth_bend, wanted.cloth_damping);
+    return needs;
+}
+
 SceneGradient scene_backward(
-    const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream, int scene,
-    bool keep_controls) {
+    const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
+    const RolloutArrays<double>& wanted, int scene, bool keep_controls) {
     const Model& model = *tape.model;
     const std::size_t count = model.bodies.size(), node_count = static_cast<std::size_t>(model.node_count());
     const Parameters parameters = read_parameters(model, inputs, scene);
@@ -299,8 +312,8 @@ SceneGradient scene_backward(
         control_gradient.node_force.assign(node_count, Vec3::Zero());
         control_gradient.node_velocity.assign(node_count, Vec3::Zero());
         step_backward(
-            model, tape.options, parameters, control, record, workspace, gradient.state, control_gradient,
-            gradient.parameters);
+            model, tape.options, parameters, control, record, step_needs(wanted, time), workspace, gradient.state,
+            control_gradient, gradient.parameters);
         // Where a kinematic body was not driven, its own velocity drove it.
         for (std::size_t i = 0; i < count; ++i) {
             if (model.bodies[i].kind != BodyKind::kinematic) continue;
@@ -444,7 +457,7 @@ void rollout_backward(
                                gradient.body_velocity.present() || gradient.body_angular_velocity.present() ||
                                gradient.node_drive.present();
     for_each_scene(tape.shape.batch, thread_count, [&](int scene, int) {
-        scenes[scene] = scene_backward(tape, inputs, upstream, scene, keep_controls);
+        scenes[scene] = scene_backward(tape, inputs, upstream, gradient, scene, keep_controls);
     });
     // Inputs that scenes share get the sum over the scenes, in their order.
     for (int scene = 0; scene < tape.shape.batch; ++scene) write_gradient(tape, inputs, gradient, scene, scenes[scene]);

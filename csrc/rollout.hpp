@@ -72,7 +72,7 @@ RolloutInfo rollout(
     Tape* tape, int thread_count);
 
 /// d(loss)/d(inputs) from d(loss)/d(trajectory). `inputs` are those of the forward; gradient arrays that are present
-/// are overwritten, the others cost nothing to speak of.
+/// are overwritten, the others cost nothing.
 void rollout_backward(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
     const RolloutArrays<double>& gradient, int thread_count);

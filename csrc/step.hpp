@@ -5,6 +5,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "contact/adjoint.hpp"
 #include "contact/zone_solver.hpp"
 #include "dynamics/free_motion.hpp"
 #include "model/state.hpp"
@@ -96,10 +97,10 @@ struct ParameterGradient {
 };
 
 /// Carry the gradient at the end of a step back to its start. `gradient` is overwritten; control and parameter
-/// gradients are added to.
+/// gradients are added to. What `needs` does not ask for is incomplete.
 void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
-    const StepRecord& record, StepWorkspace& workspace, SceneStateGradient& gradient,
+    const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient);
 
 }  // namespace diffsim

@@ -3,7 +3,6 @@
 #include <Eigen/LU>
 #include <algorithm>
 
-#include "contact/adjoint.hpp"
 #include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
 
@@ -15,13 +14,14 @@ class StepBackward {
 public:
     StepBackward(
         const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
-        const StepRecord& record, StepWorkspace& workspace, SceneStateGradient& gradient,
+        const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
         SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient)
         : m_model(model),
           m_options(options),
           m_parameters(parameters),
           m_control(control),
           m_record(record),
+          m_needs(needs),
           m_workspace(workspace),
           m_gradient(gradient),
           m_control_gradient(control_gradient),
@@ -168,7 +168,8 @@ private:
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 upstreams.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_workspace.zone.system);
+        const ZoneAdjoint adjoint =
+            zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, m_workspace.zone.system);
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
             m_local[id] = -1;
@@ -210,7 +211,8 @@ private:
                 m_parameter_gradient.cloths[cloth.id].density += mass_gradient * model.node_area[k];
             }
             evaluate(zone, point);
-            ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_workspace.zone.system);
+            ZoneAdjoint adjoint =
+                zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, m_workspace.zone.system);
             for (int k = 0; k < model.node_count(); ++k) {
                 const int node = cloth.first_node + k;
                 adjoint.place_gradient.nodes[k] += contact.place_gradient.nodes[node];
@@ -304,7 +306,7 @@ private:
             const Vec3 target_shift = dt * free_velocity(i, start, m_control.bodies[i], m_parameters, dt);
             const Vec3 turn_error = y.head<3>() - rotation.rotation;
             turn_covector -= inertia_rotation_gradient(inertia, turn_error, z.head<3>());
-            m_parameter_gradient.inertia[i] -= inertia_body_gradient(R0, turn_error, z.head<3>());
+            if (m_needs.inertia) m_parameter_gradient.inertia[i] -= inertia_body_gradient(R0, turn_error, z.head<3>());
             m_parameter_gradient.mass[i] -= z.tail<3>().dot(y.tail<3>() - target_shift);
         }
         // w1 = ŵ + (turn - target turn) / dt, v1 = v̂ + (shift - dt v̂) / dt = shift / dt
@@ -312,7 +314,7 @@ private:
         const Vec3 grad_free_velocity = dt * mass_z.tail<3>();
         const FreeRotationGradient free = free_rotation_backward(
             R0, start.angular_velocity, m_control.bodies[i].torque, inertia_body, dt, rotation, up.angular_velocity,
-            grad_rotation);
+            grad_rotation, m_needs.inertia);
         BodyStateGradient& out = m_gradient.bodies[i];
         const Vec6& pose = m_pose_gradient[i];
         const Vec3 end_covector = up.orientation + pose.head<3>();
@@ -320,7 +322,7 @@ private:
         out.position = up.position + pose.tail<3>();
         out.velocity = grad_free_velocity;
         out.angular_velocity = free.angular_velocity;
-        m_parameter_gradient.inertia[i] += free.inertia_body;
+        if (m_needs.inertia) m_parameter_gradient.inertia[i] += free.inertia_body;
         m_parameter_gradient.gravity += dt * grad_free_velocity;
         m_parameter_gradient.mass[i] -= dt / (mass * mass) * m_control.bodies[i].force.dot(grad_free_velocity);
         m_control_gradient.bodies[i].force += dt / mass * grad_free_velocity;
@@ -352,6 +354,7 @@ private:
     const Parameters& m_parameters;
     const SceneControl& m_control;
     const StepRecord& m_record;
+    const GradientNeeds& m_needs;
     StepWorkspace& m_workspace;
     SceneStateGradient& m_gradient;
     SceneControlGradient& m_control_gradient;
@@ -365,9 +368,10 @@ private:
 
 void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
-    const StepRecord& record, StepWorkspace& workspace, SceneStateGradient& gradient,
+    const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
-    StepBackward(model, options, parameters, control, record, workspace, gradient, control_gradient, parameter_gradient)
+    StepBackward(
+        model, options, parameters, control, record, needs, workspace, gradient, control_gradient, parameter_gradient)
         .run();
 }
 

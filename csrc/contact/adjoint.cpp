@@ -346,8 +346,39 @@ std::vector<double> harden(
     return reactions;
 }
 
+/// What contacts add to the gradients: `twist` times their second derivatives, and their reactions if they are hard.
+void add_contacts(
+    const Zone& zone, const ZonePoint& point, bool with_curvature, const GradientNeeds& needs,
+    const std::vector<Vec6>& twist, const std::vector<double>& reactions, ZoneAdjoint& result) {
+    const ContactTermMaker make_term(zone, point);
+    for (std::size_t k = 0; k < point.active.size(); ++k) {
+        const ActiveContact& active = point.active[k];
+        const ZoneContact& contact = zone.contacts[active.index];
+        const ContactTerm term = make_term(active, with_curvature && needs.place);
+        SmallVector motion = SmallVector::Zero(term.row.size());
+        term.for_each(
+            [&](int body, int offset) { motion.segment<6>(offset) = twist[body]; },
+            [&](int node, int offset) { motion.segment<3>(offset) = result.multiplier.nodes[node]; });
+        if (needs.place) {
+            SmallVector gradient = term.hessian * motion;
+            if (zone.hard) gradient += reactions[k] * term.row;
+            term.for_each(
+                [&](int body, int offset) { result.place_gradient.bodies[body] -= gradient.segment<6>(offset); },
+                [&](int node, int offset) { result.place_gradient.nodes[node] -= gradient.segment<3>(offset); });
+        }
+        if (!needs.mass || zone.hard) continue;  // a hard contact's stiffness is only how its multiplier was found
+        const double along = term.gradient.dot(motion);
+        for (std::size_t s = 0; s < static_cast<std::size_t>(term.side_count); ++s) {
+            const double part = -along * (s == 0 ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b);
+            if (zone.yields(term.sides[s].body)) result.mass_gradient[term.sides[s].body] += part;
+            for (int node : term.sides[s].nodes)
+                if (node >= 0) result.node_mass_gradient[node] += part;
+        }
+    }
+}
+
 /// What elasticity adds to the gradients: z times its second derivatives.
-void add_elasticity(const Zone& zone, const ZonePoint& point, ZoneAdjoint& result) {
+void add_elasticity(const Zone& zone, const ZonePoint& point, const GradientNeeds& needs, ZoneAdjoint& result) {
     const double scale = -zone.dt * zone.dt;
     std::vector<Vec3> start;
     for (const ZoneNode& node : zone.nodes) start.push_back(node.start);
@@ -356,9 +387,12 @@ void add_elasticity(const Zone& zone, const ZonePoint& point, ZoneAdjoint& resul
         const ClothParameters& parameters = (*zone.cloth_parameters)[part.id];
         const Vec3* x = point.nodes.data() + part.first_node;
         const Vec3* z = result.multiplier.nodes.data() + part.first_node;
-        add_elastic_hessian_product(
-            zone.cloth(c), parameters, zone.dt, part.start, x, z, scale,
-            result.place_gradient.nodes.data() + part.first_node);
+        if (needs.place)
+            add_elastic_hessian_product(
+                zone.cloth(c), parameters, zone.dt, part.start, x, z, scale,
+                result.place_gradient.nodes.data() + part.first_node);
+        const bool through_damping = needs.place && parameters.damping > 0.0;
+        if (!needs.material && !through_damping) continue;
         result.cloth_gradient[static_cast<std::size_t>(c)] = add_elastic_backward(
             zone.cloth(c), parameters, zone.dt, part.start, x, start.data() + part.first_node, z, scale,
             result.start_gradient.data() + part.first_node);
@@ -368,7 +402,8 @@ void add_elasticity(const Zone& zone, const ZonePoint& point, ZoneAdjoint& resul
 }  // namespace
 
 ZoneAdjoint zone_adjoint(
-    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, BlockSystem& system) {
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
+    BlockSystem& system) {
     const bool exact = mode == AdjointMode::exact;
     ZoneAdjoint result;
     ZoneDerivatives derivatives;
@@ -415,30 +450,8 @@ ZoneAdjoint zone_adjoint(
         twist[i] = result.multiplier.bodies[i];
         twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();
     }
-    const ContactTermMaker make_term(zone, point);
-    for (std::size_t k = 0; k < point.active.size(); ++k) {
-        const ActiveContact& active = point.active[k];
-        const ZoneContact& contact = zone.contacts[active.index];
-        const ContactTerm term = make_term(active, exact);
-        SmallVector motion = SmallVector::Zero(term.row.size());
-        term.for_each(
-            [&](int body, int offset) { motion.segment<6>(offset) = twist[body]; },
-            [&](int node, int offset) { motion.segment<3>(offset) = result.multiplier.nodes[node]; });
-        SmallVector gradient = term.hessian * motion;
-        if (zone.hard) gradient += reactions[k] * term.row;
-        term.for_each(
-            [&](int body, int offset) { result.place_gradient.bodies[body] -= gradient.segment<6>(offset); },
-            [&](int node, int offset) { result.place_gradient.nodes[node] -= gradient.segment<3>(offset); });
-        if (zone.hard) continue;  // the stiffness is only how the multipliers were found
-        const double along = term.gradient.dot(motion);
-        for (std::size_t s = 0; s < static_cast<std::size_t>(term.side_count); ++s) {
-            const double part = -along * (s == 0 ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b);
-            if (zone.yields(term.sides[s].body)) result.mass_gradient[term.sides[s].body] += part;
-            for (int node : term.sides[s].nodes)
-                if (node >= 0) result.node_mass_gradient[node] += part;
-        }
-    }
-    if (!zone.cloths.empty() && zone.elastic) add_elasticity(zone, point, result);
+    if (needs.place || needs.mass) add_contacts(zone, point, exact, needs, twist, reactions, result);
+    if (!zone.cloths.empty() && zone.elastic) add_elasticity(zone, point, needs, result);
     if (exact) {
         // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
         for (int i = 0; i < zone.dynamic_count; ++i)

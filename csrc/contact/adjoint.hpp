@@ -13,6 +13,14 @@
 ///  * qr: the same linear system through the pivoted QR of (stiffness^½ J L⁻ᵀ)ᵀ, M = L Lᵀ, as in Eq. 13-15.
 namespace diffsim {
 
+/// What of a gradient is asked for. The rest is left at zero, and not computed where that saves anything.
+struct GradientNeeds {
+    bool place = true;     ///< of where objects start a step, and of what moves them: velocities and drives
+    bool mass = true;      ///< of bodies, or density of cloths
+    bool inertia = true;   ///< of bodies
+    bool material = true;  ///< stretch, shear, bend and damping of cloths
+};
+
 struct ZoneAdjoint {
     Coordinates multiplier;  ///< z, one per dynamic body and node; zero at pinned nodes
     /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone, those
@@ -27,6 +35,7 @@ struct ZoneAdjoint {
 /// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution. `upstream` has one
 /// entry per dynamic body and node; those of pinned nodes are not used.
 ZoneAdjoint zone_adjoint(
-    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, BlockSystem& system);
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
+    BlockSystem& system);
 
 }  // namespace diffsim

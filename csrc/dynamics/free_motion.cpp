@@ -109,7 +109,7 @@ Mat3 inertia_body_gradient(const Mat3& R, const Vec3& w, const Vec3& covector) {
 
 FreeRotationGradient free_rotation_backward(
     const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt,
-    const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation) {
+    const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation, bool with_inertia) {
     FreeRotationGradient grad;
     if (result.substeps == 0) {  // held
         grad.angular_velocity = grad_angular_velocity;
@@ -148,14 +148,14 @@ FreeRotationGradient free_rotation_backward(
         grad_w += dt_sub * left_jacobian(dt_sub * w).transpose() * covector;
         const Vec3 multiplier = momentum_jacobian(substep, dt_sub).transpose().partialPivLu().solve(grad_w);
         grad_momentum += multiplier;
-        grad.inertia_body -= inertia_body_gradient(substep.R1, w, multiplier);
+        if (with_inertia) grad.inertia_body -= inertia_body_gradient(substep.R1, w, multiplier);
         covector = turn.transpose() * (covector - inertia_rotation_gradient(substep.inertia_world, w, multiplier));
         grad_w.setZero();
     }
     grad.orientation += covector + inertia_rotation_gradient(inertia0, angular_velocity, grad_momentum);
     grad.angular_velocity = inertia0 * grad_momentum;
     grad.torque = dt * grad_momentum;
-    grad.inertia_body += inertia_body_gradient(R0, angular_velocity, grad_momentum);
+    if (with_inertia) grad.inertia_body += inertia_body_gradient(R0, angular_velocity, grad_momentum);
     return grad;
 }
 

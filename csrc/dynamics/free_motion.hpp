@@ -25,10 +25,10 @@ struct FreeRotationGradient {
     Mat3 inertia_body = Mat3::Zero();  ///< symmetric
 };
 
-/// Gradient of a loss with gradients grad_angular_velocity and grad_rotation at the result.
+/// Gradient of a loss with gradients grad_angular_velocity and grad_rotation at the result; of the inertia if asked for.
 FreeRotationGradient free_rotation_backward(
     const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt,
-    const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation);
+    const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation, bool with_inertia);
 
 /// Rotation covector, at R, of covector · (R I_b Rᵀ w) with covector, w and I_b held fixed:
 /// d(I w) = phi x (I w) - I (phi x w).

@@ -255,7 +255,8 @@ void check_step_gradient(const Scene& scene, int least_contacts, double toleranc
     parameters.inertia.assign(count, Mat3::Zero());
     StepWorkspace workspace;
     step_backward(
-        scene.model, scene.options, scene.parameters, scene.control, record, workspace, gradient, control, parameters);
+        scene.model, scene.options, scene.parameters, scene.control, record, GradientNeeds{}, workspace, gradient,
+        control, parameters);
 
     std::vector<Input> inputs = {
         {"gravity", 3, 1e-3, [](Scene& s, const VectorX& x) { s.parameters.gravity += x; }, parameters.gravity}};

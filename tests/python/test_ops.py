@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
+import torch.utils._pytree as pytree
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vjp, vmap
 
@@ -172,6 +173,42 @@ def test_only_what_is_asked_for_is_computed(sim: ds.Simulator, state: ds.State, 
     assert velocity.grad.any()
     assert force.grad is not None
     assert force.grad.any()
+
+
+def gradients(sim: ds.Simulator, state: ds.State, control: ds.Control, names: set[str]) -> dict[str, Tensor]:
+    """Gradients of some mix of where everything ends, with respect to the inputs of these names only."""
+    inputs = (dict(sim.named_parameters()), state, control)
+    paths, structure = pytree.tree_flatten_with_path(inputs)
+    leaves = {pytree.keystr(path): t.detach().clone().requires_grad_(pytree.keystr(path) in names) for path, t in paths}
+    parameters, state, control = pytree.tree_unflatten(leaves.values(), structure)
+    outputs = pytree.tree_leaves(functional_call(sim, parameters, (state, control)))
+    loss = torch.stack([(t * torch.linspace(0.5, 1.5, t.numel()).view(t.shape)).sum() for t in outputs]).sum()
+    loss.backward()
+    return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+@pytest.mark.parametrize("coupling", ["monolithic", "split"])
+def test_each_gradient_alone_is_what_it_is_among_all(coupling: str) -> None:
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(ds.shapes.box(0.2), density=300.0, position=(0.5, 0.5, 0.62), angular_velocity=(1.0, 0.3, -0.2))
+    scene.add_body(ds.shapes.box(0.2), kind="kinematic", position=(0.5, 0.5, 0.39), velocity=(0, 0, 0.1))
+    scene.add_cloth(ds.shapes.sheet((1.0, 1.0), (4, 4)), ds.ClothMaterial(), pinned=[0], position=(0.5, 0.5, 0.505))
+    sim = ds.Simulator(scene, dt=0.01, coupling=coupling)
+    state = sim.rollout(sim.initial_state(), None, 5)[-1]
+    bodies, nodes = torch.zeros_like(state.position), torch.zeros_like(state.node_position)
+    control = ds.Control(bodies + 0.1, bodies - 0.1, nodes + 1e-3, bodies, bodies, nodes)
+    sim(state)
+    assert sim.info.contacts > 4
+    paths, _ = pytree.tree_flatten_with_path((dict(sim.named_parameters()), state, control))
+    names = {pytree.keystr(path) for path, _ in paths} - {"[0]['friction']", "[0]['restitution']"}
+    assert len(names) == 20
+    together = gradients(sim, state, control, names)
+    assert together.keys() == names
+    for name in names:
+        assert together[name].any(), name
+        (alone,) = gradients(sim, state, control, {name}).values()
+        assert torch.equal(alone, together[name]), name
 
 
 def test_backward_runs_twice_with_the_same_result(sim: ds.Simulator, state: ds.State, force: Tensor) -> None:

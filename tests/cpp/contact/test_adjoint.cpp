@@ -168,7 +168,7 @@ Coordinates without_pinned(const Zone& zone, Coordinates y) {
 
 VectorX multiplier(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode) {
     BlockSystem system;
-    return flatten(zone_adjoint(zone, point, upstream, mode, system).multiplier);
+    return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, system).multiplier);
 }
 
 void check_same_system(const Zone& zone, const ZonePoint& point) {
@@ -250,7 +250,7 @@ TEST(all_modes_agree_on_hard_contacts_with_cloth_as_far_as_they_are_straight) {
     CHECK_NEAR(by_qr, by_lu, 1e-8 * by_lu.norm());
     // J z = 0: no contact opens or closes along z.
     BlockSystem system;
-    const Coordinates z = zone_adjoint(zone, point, upstream, AdjointMode::dense, system).multiplier;
+    const Coordinates z = zone_adjoint(zone, point, upstream, AdjointMode::dense, GradientNeeds{}, system).multiplier;
     const auto distances_at = [&](double s) {
         ZonePoint moved;
         moved.y = point.y;
@@ -275,7 +275,7 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
         CHECK(point.active.size() >= 4);
         const Coordinates upstream = random_upstream(zone, 9);
         BlockSystem system;
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, system);
+        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
         // What the loss sees of pinned nodes is their own motion, which is not the adjoint's part.
         const VectorX weights = flatten(without_pinned(zone, upstream));
         const auto loss = [&](const Scene& changed) { return weights.dot(changed.solution()); };
@@ -344,7 +344,7 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
         const std::size_t count = scene.bodies.size();
         const Coordinates upstream = random_upstream(zone, 5);
         BlockSystem system;
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, system);
+        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
         const auto loss = [&](const Scene& changed) { return flatten(upstream).dot(changed.solution()); };
 
         // d(loss)/d(target) = M z
@@ -390,6 +390,26 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
     }
 }
 
+TEST(what_is_not_asked_for_is_left_at_zero) {
+    for (double compliance : {1e-2, 0.0}) {
+        Scene scene = caught();
+        scene.compliance = compliance;
+        ZonePoint point;
+        const Zone zone = scene.solve(point);
+        const Coordinates upstream = random_upstream(zone, 6);
+        BlockSystem system;
+        const GradientNeeds nothing{false, false, false, false};
+        const ZoneAdjoint all = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
+        const ZoneAdjoint none = zone_adjoint(zone, point, upstream, AdjointMode::exact, nothing, system);
+        CHECK(flatten(none.multiplier) == flatten(all.multiplier));
+        for (std::size_t i = 0; i < all.place_gradient.nodes.size(); ++i)
+            CHECK(none.place_gradient.nodes[i].isZero(0.0));
+        for (std::size_t i = 0; i < all.mass_gradient.size(); ++i) CHECK(none.mass_gradient[i] == 0.0);
+        CHECK(all.cloth_gradient[0].stretch != 0.0);
+        CHECK(none.cloth_gradient[0].stretch == 0.0);
+    }
+}
+
 TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
     const Scene scene = landing();
     ZonePoint point;
@@ -397,7 +417,7 @@ TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
     CHECK(zone.body_count() == 2);
     const Coordinates upstream = random_upstream(zone, 6);
     BlockSystem system;
-    const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, system);
+    const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
     const auto moved = [&](const VectorX& x) {
         Scene changed = scene;
         Pose& start = changed.passive.bodies[0].start;

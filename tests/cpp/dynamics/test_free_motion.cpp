@@ -50,7 +50,7 @@ struct Problem {
     VectorX gradient() const {
         const FreeRotation result = solve(VectorX::Zero(15));
         const FreeRotationGradient g =
-            free_rotation_backward(R0, w0, torque, inertia, kDt, result, weight_w / size_w, weight_rotation);
+            free_rotation_backward(R0, w0, torque, inertia, kDt, result, weight_w / size_w, weight_rotation, true);
         const Mat3& I = g.inertia_body;
         VectorX x(15);
         x << g.orientation, size_w * g.angular_velocity, size_w * g.torque, I(0, 0), I(1, 1), I(2, 2), 2.0 * I(0, 1),
@@ -218,7 +218,7 @@ TEST(a_spin_beyond_all_substeps_is_held_and_says_so) {
         CHECK(result.angular_velocity == w0);
         CHECK(result.rotation.isZero(0.0));
         const FreeRotationGradient grad = free_rotation_backward(
-            Mat3::Identity(), w0, Vec3::Zero(), inertia, 0.01, result, Vec3(1, 2, 3), Vec3(4, 5, 6));
+            Mat3::Identity(), w0, Vec3::Zero(), inertia, 0.01, result, Vec3(1, 2, 3), Vec3(4, 5, 6), true);
         CHECK(grad.angular_velocity == Vec3(1, 2, 3));
         CHECK(grad.torque.isZero(0.0));
         CHECK(grad.orientation.isZero(0.0));
