@@ -60,6 +60,29 @@ void for_each_scene(int batch, int thread_count, const Work& work) {
 
 // --- inputs --------------------------------------------------------------------------------------------------------
 
+/// Numbers as in 1 0 0, the rows of a matrix as in 1 0; 0 1.
+template <typename Matrix>
+std::string text_of(const Matrix& value) {
+    static const Eigen::IOFormat format(6, Eigen::DontAlignCols, " ", "; ");
+    std::ostringstream text;
+    if constexpr (Matrix::ColsAtCompileTime == 1)
+        text << value.transpose().format(format);
+    else
+        text << value.format(format);
+    return text.str();
+}
+
+/// Do work; what it refuses is refused with, say, "in step 3" at the end of the message if there are several.
+template <typename Work>
+void located(bool several, const char* name, int index, const Work& work) {
+    try {
+        work();
+    } catch (const std::invalid_argument& error) {
+        if (!several) throw;
+        throw std::invalid_argument(error.what() + std::string(", in ") + name + " " + std::to_string(index));
+    }
+}
+
 [[noreturn]] void refuse(const std::string& field, const Model& model, int body, const std::string& problem) {
     throw std::invalid_argument(
         field + " of body '" + model.name(body) + "' (index " + std::to_string(body) + ") " + problem);
@@ -67,19 +90,16 @@ void for_each_scene(int batch, int thread_count, const Work& work) {
 
 template <typename Vector>
 void require_finite(const char* field, const Model& model, int body, const Vector& value) {
-    if (value.allFinite()) return;
-    std::ostringstream text;
-    text << "must be finite, got (" << value.transpose() << ")";
-    refuse(field, model, body, text.str());
+    if (!value.allFinite()) refuse(field, model, body, "must be finite, got (" + text_of(value) + ")");
 }
 
 [[noreturn]] void refuse_node(const std::string& field, const Model& model, int node, const Vec3& value) {
     std::size_t cloth = 0;
     while (node >= model.cloths[cloth].first_node + model.cloths[cloth].node_count()) ++cloth;
-    std::ostringstream text;
-    text << field << " of node " << node - model.cloths[cloth].first_node << " of cloth '" << model.cloths[cloth].name
-         << "' (index " << node << ") must be finite, got (" << value.transpose() << ")";
-    throw std::invalid_argument(text.str());
+    throw std::invalid_argument(
+        field + " of node " + std::to_string(node - model.cloths[cloth].first_node) + " of cloth '" +
+        model.cloths[cloth].name + "' (index " + std::to_string(node) + ") must be finite, got (" + text_of(value) +
+        ")");
 }
 
 /// One row per node; zeros where nothing is given.
@@ -149,7 +169,8 @@ double read_cloth_parameter(
 Parameters read_parameters(const Model& model, const RolloutInputs& in, int scene) {
     Parameters parameters;
     parameters.gravity = row<3>(in.gravity.at(0, scene), 0);
-    if (!parameters.gravity.allFinite()) throw std::invalid_argument("gravity must be finite");
+    if (!parameters.gravity.allFinite())
+        throw std::invalid_argument("gravity must be finite, got (" + text_of(parameters.gravity) + ") m/s²");
     parameters.mass.resize(model.bodies.size());
     parameters.inertia.resize(model.bodies.size());
     for (int i = 0; i < model.body_count(); ++i) {
@@ -161,7 +182,7 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
         if (!(parameters.mass[i] > 0.0) || !std::isfinite(parameters.mass[i]))
             refuse("mass", model, i, "must be positive and finite, got " + std::to_string(parameters.mass[i]) + " kg");
         if (!parameters.inertia[i].allFinite() || parameters.inertia[i].llt().info() != Eigen::Success)
-            refuse("inertia", model, i, "must be positive definite");
+            refuse("inertia", model, i, "must be positive definite, got (" + text_of(given) + ") kg·m²");
     }
     for (int i = 0; i < model.cloth_count(); ++i) {
         ClothParameters cloth;
@@ -414,7 +435,7 @@ RolloutInfo rollout(
     }
     signatures.assign(static_cast<std::size_t>(shape.steps) * static_cast<std::size_t>(shape.batch), 0);
     std::vector<RolloutInfo> infos(static_cast<std::size_t>(shape.batch));
-    for_each_scene(shape.batch, thread_count, [&](int scene, int) {
+    const auto advance = [&](int scene) {
         SceneState state = read_state(*model, inputs, scene);
         refuse_crossing(*model, state);
         const Parameters parameters = read_parameters(*model, inputs, scene);
@@ -422,14 +443,17 @@ RolloutInfo rollout(
         SceneControl control;
         RolloutInfo& info = infos[scene];
         for (int time = 0; time < shape.steps; ++time) {
-            read_control(*model, inputs, time, scene, state, control);
+            located(shape.controls_have_time, "step", shape.first_step + time, [&] {
+                read_control(*model, inputs, time, scene, state, control);
+            });
             StepRecord* record = tape != nullptr ? &tape->records[scene][time] : nullptr;
             try {
                 state = step(*model, options, parameters, state, control, workspace, info.last, record);
             } catch (const PenetratingStart&) {
-                if (time == 0) throw;  // the caller's state, not ours
+                if (shape.first_step + time == 0) throw;  // the caller's state, not ours
                 state = hold(state, info.last, record);
             }
+            info.fast_impacts += info.last.fast_impacts;
             if (!info.last.converged && info.failed_steps++ == 0) info.status = info.last.status;
             signatures
                 [static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +
@@ -437,11 +461,15 @@ RolloutInfo rollout(
             if (shape.keep_time) write_state(state, trajectory, time, scene);
         }
         if (!shape.keep_time) write_state(state, trajectory, 0, scene);
+    };
+    for_each_scene(shape.batch, thread_count, [&](int scene, int) {
+        located(shape.batch > 1, "scene", scene, [&] { advance(scene); });
     });
     RolloutInfo total;
     for (const RolloutInfo& info : infos) {
         if (total.status == ZoneStatus::converged) total.status = info.status;
         total.failed_steps += info.failed_steps;
+        total.fast_impacts += info.fast_impacts;
         merge_info(total.last, info.last);
     }
     total.converged = total.failed_steps == 0;

@@ -41,6 +41,7 @@ struct TrajectoryArrays {
 struct RolloutShape {
     int steps = 1;
     int batch = 1;
+    int first_step = 0;               ///< steps that other calls made before, from the state that the user gave
     bool keep_time = false;           ///< the trajectory has all steps, or the last state only
     bool controls_have_time = false;  ///< the controls' arrays have a time axis
 };
@@ -58,6 +59,7 @@ struct Tape {
 struct RolloutInfo {
     bool converged = true;
     int failed_steps = 0;
+    int fast_impacts = 0;                       ///< of all steps
     ZoneStatus status = ZoneStatus::converged;  ///< of the first step that failed, in the first scene where one did
     StepInfo last;  ///< of the last step: counts summed over the batch, other numbers the largest
     double seconds = 0.0;

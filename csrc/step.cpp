@@ -501,6 +501,7 @@ private:
             const GroupOutcome& outcome = m.outcomes[root];
             if (!outcome.solved) continue;
             note(outcome.result);
+            m_info.fast_impacts += outcome.result.fast_impacts;
             m_info.max_compression = std::max(m_info.max_compression, outcome.max_compression);
             m_info.signature = mix(m_info.signature, outcome.signature);
         }

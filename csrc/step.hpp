@@ -37,6 +37,7 @@ struct StepInfo {
     int iterations = 0;    ///< Newton steps of the zone that took most
     double residual = 0.0;
     double max_compression = 0.0;  ///< of a contact below its rest distance [m]
+    int fast_impacts = 0;          ///< pairs of bodies with a fast ImpactGate
     double seconds_motion = 0.0, seconds_broad_phase = 0.0, seconds_zones = 0.0;
     std::uint64_t signature = 0;  ///< hash of the active contacts and their types
 };

@@ -4,7 +4,7 @@ from typing import Any
 
 from . import diagnostics, rotation, shapes
 from .materials import ClothMaterial
-from .ops import ConvergenceWarning, Info, SolverError
+from .ops import ConvergenceWarning, FastImpactWarning, Info, SolverError
 from .scene import BodyHandle, ClothHandle, Scene
 from .simulator import Simulator
 from .state import Control, State
@@ -15,6 +15,7 @@ __all__ = [
     "ClothMaterial",
     "Control",
     "ConvergenceWarning",
+    "FastImpactWarning",
     "Info",
     "Scene",
     "Simulator",

@@ -77,6 +77,8 @@ class Info:
     @property
     def failed_steps(self) -> int: ...
     @property
+    def fast_impacts(self) -> int: ...
+    @property
     def failure(self) -> str: ...
     @property
     def contacts(self) -> int: ...
@@ -115,6 +117,7 @@ def rollout(
     keep_time: bool,
     record: bool,
     num_threads: int,
+    first_step: int,
 ) -> Rollout: ...
 def rollout_backward(
     tape: Tape,

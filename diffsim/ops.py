@@ -14,7 +14,7 @@ from torch import Tensor
 from . import _core
 from ._check import CLOTH_PARAMETERS, CONTROL_FIELDS, PARAMETERS, STATE_FIELDS
 
-__all__ = ["ConvergenceWarning", "Info", "RolloutCall", "SolverError", "rollout"]
+__all__ = ["ConvergenceWarning", "FastImpactWarning", "Info", "RolloutCall", "SolverError", "rollout"]
 
 # Whether torch.func transforms (vmap, grad, ...) are running. They dispatch through Function.apply; without them two
 # shortcuts are open that halve the cost of a call.
@@ -27,6 +27,10 @@ _INPUT_COUNT = len(_BASE_NDIM)
 _CONTROLS = range(6, 12)
 
 OptionalTensors = tuple[Tensor | None, ...]
+
+
+class FastImpactWarning(UserWarning):
+    """Bodies met that move as far in a step as they are large; see `Info.fast_impacts`. Warned once per simulator."""
 
 
 class ConvergenceWarning(UserWarning):
@@ -43,6 +47,9 @@ class Info:
     converged: bool  #: every step of every scene of the call
     failed_steps: int  #: steps of the call that did not converge, all scenes
     failure: str  #: why the first of them did not; "" if all converged
+    #: in all steps of the call, pairs of bodies that met while moving about as far in a step as the smaller is large
+    #: (1.5 times its radius): such bodies can come around each other within a few steps
+    fast_impacts: int
     contacts: int  #: contacts in the zones' optimizations
     zones: int  #: independent groups of bodies and cloths in contact
     largest_zone: int  #: bodies and cloths in the largest of them
@@ -76,6 +83,7 @@ class RolloutCall:
 
     __slots__ = (
         "controls_have_time",
+        "first_step",
         "info",
         "keep_tape",
         "keep_time",
@@ -99,6 +107,7 @@ class RolloutCall:
         keep_time: bool = False,
         keep_tape: bool = True,
         want_signature: bool = False,
+        first_step: int = 0,
     ) -> None:
         self.model = model
         self.options = options
@@ -108,6 +117,7 @@ class RolloutCall:
         self.keep_time = keep_time
         self.keep_tape = keep_tape  # False: the backward runs the forward again instead (checkpointing)
         self.want_signature = want_signature
+        self.first_step = first_step  # how many steps other calls made before
         self.record = False
         self.tape: _core.Tape | None = None
         self.info: _core.Info | None = None
@@ -134,6 +144,7 @@ def _run(call: RolloutCall, arrays: list[Any], record: bool) -> _core.Rollout:
         keep_time=call.keep_time,
         record=record,
         num_threads=call.num_threads,
+        first_step=call.first_step,
     )
 
 

@@ -26,7 +26,7 @@ from ._check import (
 from ._cloth_energy import cloth_elements
 from ._inputs import Controls, Inputs, checked_inputs
 from ._measurements import Measurements
-from .ops import ConvergenceWarning, Info, RolloutCall, SolverError, rollout
+from .ops import ConvergenceWarning, FastImpactWarning, Info, RolloutCall, SolverError, rollout
 from .scene import Scene
 from .state import Control, State
 
@@ -135,6 +135,7 @@ class Simulator(Measurements):
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
         self._info: Info | list[Any] | None = None  # a list of the core's, one per segment, until someone asks
         self._warned = False
+        self._warned_fast = False
         self._build()
         if self._check:
             self._separate_scene()
@@ -326,6 +327,7 @@ class Simulator(Measurements):
                     keep_time=True,
                     keep_tape=checkpoint_every is None or steps <= every,
                     want_signature=want_signature,
+                    first_step=start,
                 )
                 part = driven
                 if has_time and count < steps:
@@ -420,6 +422,14 @@ class Simulator(Measurements):
     def _finish(self, segments: list[Any], result: State) -> None:
         """Keeps the statistics of the call, and warns or raises if a step did not converge."""
         self.__dict__["_info"] = segments  # nn.Module's __setattr__ and Info itself take too long
+        if not self._warned_fast and any(segment.fast_impacts for segment in segments):
+            self._warned_fast = True
+            warnings.warn(
+                "Simulator: bodies met that move about as far in a step as the smaller of them is large; within a few"
+                " steps they can come around each other. Use a smaller dt; see also sim.info.fast_impacts",
+                FastImpactWarning,
+                stacklevel=_frames_to_user(),
+            )
         if all(segment.converged for segment in segments):
             return
         info = self.info
@@ -511,6 +521,7 @@ def _combined(segments: list[Any]) -> Info:
     return Info(
         converged=all(segment.converged for segment in segments),
         failed_steps=sum(segment.failed_steps for segment in segments),
+        fast_impacts=sum(segment.fast_impacts for segment in segments),
         failure=next((segment.failure for segment in segments if not segment.converged), ""),
         contacts=last.contacts,
         zones=last.zones,

@@ -186,7 +186,7 @@ struct Rollout {
 
 Rollout bound_rollout(
     const std::shared_ptr<Model>& model, const Options& options, const InputArrays& inputs, int steps,
-    bool controls_have_time, bool keep_time, bool record, int num_threads) {
+    bool controls_have_time, bool keep_time, bool record, int num_threads, int first_step) {
     if (steps < 1) throw std::invalid_argument("steps must be at least 1");
     const Fields fields = input_fields(*model);
     const Leading leading = find_leading(inputs, fields, steps, controls_have_time);
@@ -202,7 +202,7 @@ Rollout bound_rollout(
         *slots[k] = trajectory_view(out.mutable_data(), leading, keep_time, core);
         result.trajectory[k] = std::move(out);
     }
-    const RolloutShape shape{steps, static_cast<int>(leading.batch), keep_time, controls_have_time};
+    const RolloutShape shape{steps, static_cast<int>(leading.batch), first_step, keep_time, controls_have_time};
     std::vector<std::uint64_t> signatures;
     {
         py::gil_scoped_release unlocked;
@@ -353,6 +353,7 @@ void bind_rollout(py::module_& module) {
     py::class_<RolloutInfo>(module, "Info", "Statistics of a rollout; counts are those of its last step.")
         .def_readonly("converged", &RolloutInfo::converged)
         .def_readonly("failed_steps", &RolloutInfo::failed_steps)
+        .def_readonly("fast_impacts", &RolloutInfo::fast_impacts)
         .def_property_readonly("failure", [](const RolloutInfo& info) { return failure_text(info.status); })
         .def_property_readonly("contacts", [](const RolloutInfo& info) { return info.last.contacts; })
         .def_property_readonly("zones", [](const RolloutInfo& info) { return info.last.zones; })
@@ -371,7 +372,7 @@ void bind_rollout(py::module_& module) {
     module.def(
         "rollout", &bound_rollout, py::arg("model"), py::arg("options"), py::arg("inputs").noconvert(), py::kw_only(),
         py::arg("steps"), py::arg("controls_have_time"), py::arg("keep_time"), py::arg("record"),
-        py::arg("num_threads"));
+        py::arg("num_threads"), py::arg("first_step"));
 
     module.def(
         "rollout_backward", &bound_backward, py::arg("tape"), py::arg("inputs").noconvert(),

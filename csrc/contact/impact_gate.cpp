@@ -6,6 +6,7 @@ namespace diffsim {
 namespace {
 
 constexpr double kPassingPart = 0.5;  // of the smaller body's radius
+constexpr double kFastPart = 1.5;     // boxes pass each other from there on
 
 double size(const Zone& zone, int body) {
     return zone.mesh(body).radius + zone.model->bodies[zone.bodies[body].id].margin;
@@ -42,9 +43,11 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
         const int a = contact.a, b = contact.b;
         const auto same = [&](const ImpactGate& gate) { return gate.a == a && gate.b == b; };
         if (std::any_of(gates.begin(), gates.end(), same)) continue;
-        const double passing = kPassingPart * std::min(size(zone, a), size(zone, b));
+        const double radius = std::min(size(zone, a), size(zone, b));
+        const double passing = kPassingPart * radius;
         const Vec6 relative = (y_end.bodies[a] - point.y.bodies[a]) - (y_end.bodies[b] - point.y.bodies[b]);
-        if (relative.tail<3>().norm() <= passing) continue;
+        const double travel = relative.tail<3>().norm();
+        if (travel <= passing) continue;
         const Vec6 y_a = point.y.bodies[a] + impact.toi * (y_end.bodies[a] - point.y.bodies[a]);
         const Vec6 y_b = point.y.bodies[b] + impact.toi * (y_end.bodies[b] - point.y.bodies[b]);
         const ContactGeometry geometry = contact_geometry(
@@ -52,7 +55,7 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
             zone.ground_height);
         gates.push_back(
             {a, b, in_body(zone, a, y_a, geometry.closest.point_a), in_body(zone, b, y_b, geometry.closest.point_b),
-             geometry.normal, contact.range.rest, passing});
+             geometry.normal, contact.range.rest, passing, travel > kFastPart * radius});
     }
     return gates;
 }

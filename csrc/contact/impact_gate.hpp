@@ -8,6 +8,7 @@
 /// against the motion of one step; behind it the energy is as low as if it were not there. To the user that is passing
 /// through. So the first impact of two bodies on the straight way to their targets is remembered: their points that met
 /// there may pass each other along the normal by sliding or rolling off, but not by more than a part of the smaller body.
+/// It does not hold for the next step, by which fast bodies may have come around each other.
 namespace diffsim {
 
 struct ImpactGate {
@@ -16,6 +17,7 @@ struct ImpactGate {
     Vec3 normal;             ///< from b to a, zone frame
     double rest;             ///< distance along it at which their surfaces touch [m]
     double allowed_passing;  ///< [m]
+    bool fast;               ///< they would move against each other by three quarters of the smaller's size or more
 };
 
 /// Whether some body moves so far, for the size of the smallest, that two may have gates. Cheap.

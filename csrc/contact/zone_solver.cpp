@@ -113,6 +113,7 @@ private:
         if ((m_zone.dynamic_count > 0 || !m_zone.elastic) &&
             allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
             m_gates = find_impact_gates(m_zone, m_w.point, m_w.y_end);
+            for (const ImpactGate& gate : m_gates) m_result.fast_impacts += gate.fast ? 1 : 0;
             return false;
         }
         if (touching) return false;

@@ -22,6 +22,7 @@ struct ZoneResult {
     ZoneStatus status = ZoneStatus::converged;
     int iterations = 0;      ///< Newton steps
     double residual = 0.0;   ///< largest |L⁻¹ g| of a body, M = L Lᵀ, relative to the largest contact force
+    int fast_impacts = 0;    ///< pairs of bodies with a fast ImpactGate
     int worst_contact = -1;  ///< for bad_start and blocked: index into Zone::contacts, or -1
 };
 

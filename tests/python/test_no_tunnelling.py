@@ -50,6 +50,7 @@ def assert_stays_above(scene: ds.Scene, speed: float) -> ds.State:
     with warnings.catch_warnings():
         # A step that gives up must be safe, too: what is judged here is where things are.
         warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        warnings.simplefilter("ignore", ds.FastImpactWarning)
         trajectory = sim.rollout(state, None, 20)
     check = PenetrationCheck(scene, sim.thickness)
     for step, frame in enumerate(trajectory):
@@ -102,6 +103,7 @@ def test_two_free_boxes_do_not_pass_through_each_other(speed: float) -> None:
     state = sim.initial_state()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        warnings.simplefilter("ignore", ds.FastImpactWarning)
         trajectory = sim.rollout(state, None, 20)
     check = PenetrationCheck(scene, sim.thickness)
     for frame in trajectory:
@@ -172,6 +174,7 @@ def test_a_box_that_slides_on_the_ground_does_not_pass_one_at_rest(speed: float)
     velocity[0, 0] = speed
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        warnings.simplefilter("ignore", ds.FastImpactWarning)
         end = sim(state.replace(velocity=velocity))
     assert end.position[0, 0] < end.position[1, 0]
     assert end.velocity[1, 0] > 1e-3  # it was pushed
@@ -188,5 +191,36 @@ def test_balls_that_glance_off_each_other_gain_no_energy(speed: float) -> None:
     energy = sim.kinetic_energy(state)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        warnings.simplefilter("ignore", ds.FastImpactWarning)
         state = sim.rollout(state, None, 5)[-1]
     assert sim.kinetic_energy(state) < 0.6 * energy  # they met: the approach along the line of centres is gone
+
+
+@pytest.mark.parametrize(("speed", "impacts"), [(5.0, 0), (14.0, 0), (16.0, 1), (50.0, 1)])
+def test_impacts_too_fast_for_the_step_are_counted(speed: float, impacts: int) -> None:
+    """Two balls 0.2 m across that meet in the second step: 0.05 to 0.5 m of way in it."""
+    scene = ds.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_sphere(0.1, density=1000.0, position=(-0.2 - 0.015 * speed, 0.0, 0.0), velocity=(speed, 0.0, 0.0))
+    scene.add_sphere(0.1, density=1000.0, position=(0.0, 0.0, 0.0))
+    sim = ds.Simulator(scene, dt=0.01)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            sim.rollout(sim.initial_state(), None, 2)
+    assert sim.info is not None
+    assert sim.info.fast_impacts == impacts
+    assert [w.category for w in caught if w.category is ds.FastImpactWarning] == [ds.FastImpactWarning] * impacts
+    if impacts:
+        assert sim(sim.initial_state()).position.isfinite().all()  # a step of free motion
+        assert sim.info.fast_impacts == 0
+
+
+def test_the_ground_is_never_too_fast() -> None:
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_sphere(0.1, density=1000.0, position=(0.0, 0.0, 0.3), velocity=(0.0, 0.0, -1000.0))
+    sim = ds.Simulator(scene, dt=0.01)
+    sim(sim.initial_state())
+    assert sim.info is not None
+    assert sim.info.contacts == 1
+    assert sim.info.fast_impacts == 0

@@ -207,6 +207,29 @@ def test_bad_parameters_are_refused_by_name(parameter: str, value: float, text: 
         sim(state)
 
 
+def test_refusals_tell_the_value_the_scene_and_the_step() -> None:
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    batch = sim.initial_state(batch=3)
+    batch.velocity[2, 0, 1] = math.nan
+    with pytest.raises(ValueError, match=r"state.velocity of body 'cube'.*got \(0 nan 0\), in scene 2$"):
+        sim(batch)
+    state = sim.initial_state()
+    force = torch.zeros(5, *state.position.shape, dtype=torch.float64)
+    force[4, 0, 0] = math.inf
+    for checkpoint_every in (None, 2):
+        with pytest.raises(ValueError, match=r"control.force of body 'cube'.*got \(inf 0 0\), in step 4$"):
+            sim.rollout(state, ds.Control(force=force), 5, checkpoint_every=checkpoint_every)
+    with torch.no_grad():
+        sim.inertia[0] *= -1.0
+    with pytest.raises(ValueError, match=r"inertia of body 'cube' .*must be positive definite, got \(-.*; .*\) kg·m²$"):
+        sim(state)
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    with torch.no_grad():
+        sim.gravity[0] = math.nan
+    with pytest.raises(ValueError, match=r"gravity must be finite, got \(nan 0 -9.81\) m/s²"):
+        sim(state)
+
+
 def test_a_quaternion_that_is_none_is_refused_by_name() -> None:
     sim = ds.Simulator(squeeze(), dt=0.01)
     state = sim.initial_state()
