@@ -1,20 +1,14 @@
 #include "contact/zone.hpp"
 
-#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
 #include <iterator>
 
+#include "math/positive_part.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
 namespace {
-
-template <int N>
-Eigen::Matrix<double, N, N> positive_part(const Eigen::Matrix<double, N, N>& symmetric) {
-    const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, N, N>> eigen(symmetric);
-    return eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0.0).asDiagonal() * eigen.eigenvectors().transpose();
-}
 
 /// |L⁻¹ g| of one body.
 double scaled_norm(const ZoneBody& body, const Vec6& gradient) {
