@@ -263,6 +263,10 @@ private:
             m.boxes.push_back(box);
         }
         m.groups.reset(object_count());
+        if (m_options.global_zone) {
+            for (int i : m.movers) m.groups.unite(m.movers[0], i);
+            return;
+        }
         for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes))) m.groups.unite(m.movers[a], m.movers[b]);
     }
 
@@ -426,7 +430,7 @@ private:
 
     // --- results -----------------------------------------------------------------------------------------------
 
-    /// Zones of objects that really touch, and of every cloth: what the backward solves together.
+    /// Zones of objects that really touch, and of every cloth: what the backward solves together. Or one of all movers.
     void find_zones() {
         const int count = object_count();
         const auto yields = [&](int object) {
@@ -435,6 +439,12 @@ private:
         m.touching.reset(count);
         m.zone_of.assign(static_cast<std::size_t>(count), -1);
         for (int c = m_model.body_count(); c < count; ++c) m.zone_of[c] = 0;
+        if (m_options.global_zone) {
+            for (int i : m.movers) {
+                m.zone_of[i] = 0;
+                m.touching.unite(m.movers[0], i);
+            }
+        }
         const auto for_each_contact = [&](const auto& visit) {
             for (int root : m.movers)
                 for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k) visit(k);

@@ -55,6 +55,7 @@ class Options:
         tolerance: float = 1e-10,
         max_iterations: int = 200,
         coupling: str = "monolithic",
+        zones: str = "local",
     ) -> None: ...
     dt: float
     compliance: float
@@ -62,6 +63,7 @@ class Options:
     tolerance: float
     max_iterations: int
     coupling: str
+    zones: str
 
 class Tape:
     """What the backward of a rollout needs."""

@@ -72,6 +72,8 @@ class Simulator(Measurements):
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
         coupling: "monolithic" or "split": whether cloth and what touches it are solved at once, or the cloth's elastic
             step first and its contacts after it, as the paper does. Without cloth the two are the same.
+        zones: "local": bodies and cloths are solved together only if they may meet, the default. "global": all at once,
+            the same result for more work; there to measure what locality saves.
         tolerance: Relative KKT residual at which a step has converged.
         max_iterations: Newton iterations a step may take. Default: 200, in scenes with cloth 2000.
         num_threads: Solve that much at a time; no result depends on it. Default: `torch.get_num_threads()`.
@@ -100,6 +102,7 @@ class Simulator(Measurements):
         compliance: float = 1e-4,
         adjoint: str = "exact",
         coupling: str = "monolithic",
+        zones: str = "local",
         tolerance: float = 1e-10,
         max_iterations: int | None = None,
         num_threads: int | None = None,
@@ -111,6 +114,7 @@ class Simulator(Measurements):
         check_instance(where, "scene", scene, Scene, "be a diffsim.Scene")
         check_choice(where, "adjoint", adjoint, ("exact", "qr", "dense"))
         check_choice(where, "coupling", coupling, ("monolithic", "split"))
+        check_choice(where, "zones", zones, ("local", "global"))
         check_choice(where, "on_failure", on_failure, ("warn", "raise"))
         compliance = check_number(where, "compliance", compliance, least=0.0)
         self._dt = check_number(where, "dt", dt, above=0.0)
@@ -120,6 +124,7 @@ class Simulator(Measurements):
             "adjoint": adjoint,
             "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
             "coupling": coupling,
+            "zones": zones,
         }
         self._num_threads = None if num_threads is None else check_count(where, "num_threads", num_threads)
         self._on_failure = on_failure

@@ -125,6 +125,14 @@ bool parse_coupling(const std::string& text) {
     return text == "split";
 }
 
+bool parse_zones(const std::string& text) {
+    if (text != "local" && text != "global")
+        throw std::invalid_argument("zones must be 'local' or 'global', got '" + text + "'");
+    return text == "global";
+}
+
+const char* zones_text(bool global) { return global ? "global" : "local"; }
+
 const char* coupling_text(bool split) { return split ? "split" : "monolithic"; }
 
 const char* adjoint_text(AdjointMode mode) {
@@ -151,7 +159,7 @@ void bind_model(py::module_& module) {
     py::class_<Options>(module, "Options", "How steps are taken.")
         .def(
             py::init([](double dt, double compliance, const std::string& adjoint, double tolerance, int max_iterations,
-                        const std::string& coupling) {
+                        const std::string& coupling, const std::string& zones) {
                 Options options;
                 options.dt = dt;
                 options.compliance = compliance;
@@ -159,11 +167,13 @@ void bind_model(py::module_& module) {
                 options.tolerance = tolerance;
                 options.max_iterations = max_iterations;
                 options.split = parse_coupling(coupling);
+                options.global_zone = parse_zones(zones);
                 return options;
             }),
             py::kw_only(), py::arg("dt"), py::arg("compliance") = defaults.compliance,
             py::arg("adjoint") = adjoint_text(defaults.adjoint), py::arg("tolerance") = defaults.tolerance,
-            py::arg("max_iterations") = defaults.max_iterations, py::arg("coupling") = coupling_text(defaults.split))
+            py::arg("max_iterations") = defaults.max_iterations, py::arg("coupling") = coupling_text(defaults.split),
+            py::arg("zones") = zones_text(defaults.global_zone))
         .def_readwrite("dt", &Options::dt)
         .def_readwrite("compliance", &Options::compliance)
         .def_readwrite("tolerance", &Options::tolerance)
@@ -173,7 +183,10 @@ void bind_model(py::module_& module) {
             [](Options& options, const std::string& text) { options.adjoint = parse_adjoint(text); })
         .def_property(
             "coupling", [](const Options& options) { return coupling_text(options.split); },
-            [](Options& options, const std::string& text) { options.split = parse_coupling(text); });
+            [](Options& options, const std::string& text) { options.split = parse_coupling(text); })
+        .def_property(
+            "zones", [](const Options& options) { return zones_text(options.global_zone); },
+            [](Options& options, const std::string& text) { options.global_zone = parse_zones(text); });
 }
 
 }  // namespace diffsim::bindings

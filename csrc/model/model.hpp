@@ -63,7 +63,8 @@ struct Options {
     AdjointMode adjoint = AdjointMode::exact;  ///<
     double tolerance = 1e-10;                  ///< on the force balance, relative to the largest contact force [1]
     int max_iterations = 200;                  ///< Newton steps per zone and step
-    bool split = false;  ///< cloth moves without contact first, then contacts act on its nodes (split coupling)
+    bool split = false;        ///< cloth moves without contact first, then contacts act on its nodes (split coupling)
+    bool global_zone = false;  ///< all that yields is one zone, whether it meets or not
 };
 
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.

@@ -39,6 +39,7 @@ def state(sim: ds.Simulator) -> ds.State:
         ({"compliance": -1.0}, ValueError, "compliance must be finite and at least 0, got -1.0"),
         ({"adjoint": "fast"}, ValueError, "adjoint must be one of 'exact', 'qr', 'dense', got 'fast'"),
         ({"coupling": "none"}, ValueError, "coupling must be one of 'monolithic', 'split', got 'none'"),
+        ({"zones": "none"}, ValueError, "zones must be one of 'local', 'global', got 'none'"),
         ({"tolerance": 0.0}, ValueError, "tolerance must be finite and larger than 0"),
         ({"max_iterations": 0}, ValueError, "max_iterations must be at least 1, got 0"),
         ({"max_iterations": 2.5}, TypeError, "max_iterations must be a whole number, got float"),
