@@ -1,0 +1,251 @@
+"""Train a policy through the physics, data-parallel over scenes: `torchrun --nproc_per_node 2 train_distributed.py`.
+
+A ball strikes another, which shall be at a given place after 0.6 s, a different one in every scene. A small network
+sees the place and chooses the velocity of the striker; the loss is the squared distance, and its gradient comes back
+to the network through the collision. Network and simulator are one module, `Policy`, which
+`torch.nn.parallel.DistributedDataParallel` takes as it takes any other: every process plays its share of the scenes,
+one batch per call, and the gradients are averaged between processes (gloo). With plain python, one process plays them
+all, to the same result but for rounding.
+
+Writes out/train_distributed.png and checks itself: the exit code says whether all that `check` looks at holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed
+from _stage import report, save_figure
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+import diffsim as ds
+
+DT, STEPS = 0.02, 30
+RADIUS, GAP = 0.05, 0.1  # of both balls; between them at first [m]
+SCENES = 32  # per iteration, over all processes
+TESTS = 64  # scenes no network was trained on
+NEAREST, FARTHEST, WIDEST = 0.3, 0.8, math.radians(25.0)  # where targets are, seen from the ball that is struck
+RATE, ITERATIONS = 0.01, 300
+
+FALL = 100.0  # the mean squared distance must fall by this
+HIT = 0.95  # part of the test scenes in which the ball must have been struck
+SAME_GRADIENT = 1e-10  # between one process with all scenes and several with a part each, relative
+
+
+# ---- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def build_scene() -> ds.Scene:
+    """Two balls on smooth ground."""
+    scene = ds.Scene()
+    scene.add_ground()
+    for name, x in (("striker", -2.0 * RADIUS - GAP), ("ball", 0.0)):
+        scene.add_sphere(RADIUS, density=1000.0, position=(x, 0.0, RADIUS), name=name)
+    return scene
+
+
+def targets(count: int, seed: int) -> Tensor:
+    """Places for the ball, (count, 2) [m]."""
+    generator = torch.Generator().manual_seed(seed)
+    u, v = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    distance, angle = NEAREST + (FARTHEST - NEAREST) * u, WIDEST * (2.0 * v - 1.0)
+    return torch.stack([distance * angle.cos(), distance * angle.sin()], dim=-1)
+
+
+class Policy(nn.Module):
+    """From targets (B, 2) to where the ball is in the end (B, 2): network and physics."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)  # the same in every process
+        layers = nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 2)
+        self.network = nn.Sequential(*layers).double()
+        with torch.no_grad():
+            self.network[-1].weight.mul_(0.1)
+            self.network[-1].bias.copy_(torch.tensor([1.5, 0.0]))  # straight ahead: who misses learns nothing
+        self.sim = ds.Simulator(build_scene(), dt=DT)
+        self.start = self.sim.initial_state()
+
+    def forward(self, target: Tensor) -> Tensor:
+        seen = (target - target.new_tensor([0.5 * (NEAREST + FARTHEST), 0.0])) / (0.5 * (FARTHEST - NEAREST))
+        launch = nn.functional.pad(self.network(seen), (0, 1))  # along the ground
+        velocity = torch.stack([launch, torch.zeros_like(launch)], dim=1)
+        trajectory = self.sim.rollout(self.start.replace(velocity=velocity), None, STEPS)
+        return trajectory.position[-1, :, 1, :2]
+
+
+def squared_distance(reached: Tensor, target: Tensor) -> Tensor:
+    """Mean over scenes."""
+    return (reached - target).square().sum(-1).mean()
+
+
+# ---- training --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which process this is, of how many."""
+
+    rank: int = 0
+    count: int = 1
+
+    def part(self, scenes: Tensor) -> Tensor:
+        """This process's scenes. All parts have the same size, so that the mean of means is the mean of all."""
+        assert len(scenes) % self.count == 0
+        return scenes.chunk(self.count)[self.rank]
+
+    def mean(self, value: Tensor) -> Tensor:
+        """Over processes."""
+        value = value.detach().clone()
+        if self.count > 1:
+            torch.distributed.all_reduce(value)
+        return value / self.count
+
+
+@contextmanager
+def processes() -> Iterator[Share]:
+    """What torchrun says, or one process."""
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Share()
+        return
+    if SCENES % count:
+        raise SystemExit(f"error: {SCENES} scenes cannot be shared equally between {count} processes")
+    torch.distributed.init_process_group("gloo")
+    try:
+        yield Share(torch.distributed.get_rank(), count)
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def gradient(policy: nn.Module) -> Tensor:
+    """Of the network, as one vector."""
+    return torch.cat([p.grad.flatten() for p in policy.parameters() if p.grad is not None])
+
+
+@dataclass
+class Training:
+    policy: Policy
+    share: Share
+    first_gradient: Tensor  # as the processes averaged it
+    losses: list[float] = field(default_factory=list)  # mean over all scenes
+
+
+def train(share: Share, iterations: int) -> Training:
+    policy = Policy()
+    module: nn.Module = policy if share.count == 1 else DistributedDataParallel(policy)
+    optimiser = torch.optim.Adam(policy.network.parameters(), lr=RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
+    training = Training(policy, share, torch.empty(0))
+    for iteration in range(iterations):
+        target = share.part(targets(SCENES, seed=iteration))
+        optimiser.zero_grad()
+        loss = squared_distance(module(target), target)
+        loss.backward()
+        if iteration == 0:
+            training.first_gradient = gradient(policy).clone()
+        optimiser.step()
+        schedule.step()
+        training.losses.append(float(share.mean(loss)))
+        if share.rank == 0 and (iteration % 50 == 0 or iteration == iterations - 1):
+            print(f"iteration {iteration:4d}: root of the mean squared distance {training.losses[-1] ** 0.5:.4f} m")
+    return training
+
+
+# ---- checks ----------------------------------------------------------------------------------------------------------
+
+
+def reference_gradient() -> Tensor:
+    """The first gradient by one process with all scenes."""
+    policy, target = Policy(), targets(SCENES, seed=0)
+    squared_distance(policy(target), target).backward()
+    return gradient(policy)
+
+
+def evaluate(policy: Policy) -> tuple[float, float]:
+    """Mean squared distance [m²] and part of the balls struck, in scenes not trained on."""
+    target = targets(TESTS, seed=-1)
+    with torch.no_grad():
+        reached = policy(target)
+    return float(squared_distance(reached, target)), float((reached.norm(dim=-1) > 0.5 * NEAREST).double().mean())
+
+
+def check(training: Training) -> bool:
+    """True if all holds; every process has to call it."""
+    share, policy = training.share, training.policy
+    expected = reference_gradient()
+    error = float((training.first_gradient - expected).norm() / expected.norm())
+    weights = torch.cat([p.detach().flatten() for p in policy.network.parameters()])
+    spread = float((share.mean(weights) - weights).abs().max())
+    (before, _), (after, struck) = evaluate(Policy()), evaluate(policy)
+    info = policy.sim.info
+    assert info is not None
+    holds = [
+        (f"gradient of {share.count} process(es) equals that of one to {error:.1e}", error <= SAME_GRADIENT),
+        (f"processes have the same weights (spread {spread:.1e})", spread == 0.0),
+        (f"every step converged ({info.failed_steps} did not)", info.converged),
+        (f"{100.0 * struck:.0f} % of {TESTS} new balls were struck", struck >= HIT),
+        (f"mean squared distance to {TESTS} new targets fell {before / after:.0f} times", before >= FALL * after),
+    ]
+    return report(holds) if share.rank == 0 else all(holds for _, holds in holds)
+
+
+# ---- picture ---------------------------------------------------------------------------------------------------------
+
+
+def draw(training: Training, path: Path) -> None:
+    target = targets(TESTS, seed=-1)
+    with torch.no_grad():
+        reached = training.policy(target)
+
+    def fill(figure: Any) -> None:
+        left, right = figure.subplots(1, 2)
+        left.semilogy([loss**0.5 for loss in training.losses], color="0.25")
+        left.set(xlabel="iteration", ylabel="root of mean squared distance [m]")
+        left.grid(True, alpha=0.3)
+        right.plot(*target.T, "o", ms=9, mfc="none", mec="#0a7d33", label="target")
+        right.plot(*reached.T, ".", ms=6, color="#b03a2e", label="ball")
+        right.plot([0.0, -2.0 * RADIUS - GAP], [0.0, 0.0], "o", ms=12, color="0.7")
+        right.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="scenes not trained on")
+        right.legend()
+
+    save_figure(path, fill, figsize=(10.0, 4.0))
+
+
+# ---- program ---------------------------------------------------------------------------------------------------------
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="of training (default: %(default)s)")
+    parser.add_argument("--gradient", type=Path, help="file for the gradient of the first iteration (torch.save)")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
+    parser.add_argument("--no-picture", action="store_true")
+    options = parser.parse_args(argv)
+    begin = time.perf_counter()
+    with processes() as share:
+        training = train(share, options.iterations)
+        if options.gradient is not None and share.rank == 0:
+            torch.save(training.first_gradient, options.gradient)
+        if not options.no_picture and share.rank == 0:
+            draw(training, options.out / "train_distributed.png")
+        passed = check(training)
+        if share.rank == 0:
+            verdict, seconds = "passed" if passed else "FAILED", time.perf_counter() - begin
+            print(f"{verdict} in {seconds:.0f} s, {share.count} process(es)")
+    return 0 if passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
