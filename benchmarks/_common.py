@@ -1,16 +1,37 @@
-"""What benchmarks share: the header that names machine and versions, timing in turns, memory."""
+"""What benchmarks share: the header that names machine and versions, timing in turns, memory, plots."""
 
 from __future__ import annotations
 
+import argparse
 import math
+import multiprocessing
 import os
 import platform
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+import diffsim as ds
+
+Result = TypeVar("Result")
+
+
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """With what every benchmark understands."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a smoke run of a few seconds; its numbers mean nothing")
+    return parser
+
+
+# ---- output ----------------------------------------------------------------------------------------------------------
 
 
 def processor() -> str:
@@ -39,7 +60,40 @@ def print_header(*distributions: str) -> None:
 
 
 def print_row(values: Iterable[object]) -> None:
-    print(*(f"{value:.4g}" if isinstance(value, float) else value for value in values), sep=",", flush=True)
+    """One CSV line. None is an empty field: a peer has no figure there."""
+    texts = (f"{value:.4g}" if isinstance(value, float) else value for value in values)
+    print(*("" if text is None else text for text in texts), sep=",", flush=True)
+
+
+def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9.6, 3.8)) -> None:
+    """Make a figure, let `draw(figure)` fill it, write it."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=size, layout="constrained")
+    draw(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+    print(f"# plot: {path}")
+
+
+def draw_curves(
+    axes: Any, curves: Mapping[str, tuple[Sequence[float], Sequence[float | None]]], xlabel: str, ylabel: str
+) -> None:
+    """Log-log; None is a point left out. Names with brackets are drawn broken: figures not measured in this run."""
+    for name, (x, y) in curves.items():
+        points = [(a, b) for a, b in zip(x, y) if b is not None]
+        if points:
+            axes.plot(*zip(*points), marker="o", ms=4.0, lw=1.4, ls=(0, (4, 3)) if "(" in name else "-", label=name)
+    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    axes.grid(True, which="major", alpha=0.3)
+    axes.legend(fontsize=8)
+
+
+# ---- time and memory -------------------------------------------------------------------------------------------------
 
 
 def in_turns(
@@ -67,6 +121,12 @@ def slope(x: list[float], y: list[float]) -> float:
     return statistics.linear_regression(*([math.log(v) for v in values] for values in (x, y))).slope
 
 
+def in_fresh_process(function: Callable[..., Result], *arguments: object) -> Result:
+    """The result of a call in a process of its own, whose memory nothing has used before."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
 def added_memory(call: Callable[[], object]) -> float:
     """How far the peak of resident memory during a call is above what was resident before [MB]; nan but on Linux.
 
@@ -86,3 +146,34 @@ def _status_megabytes(field: str) -> float:
         if line.startswith(f"{field}:"):
             return float(line.split()[1]) / 1024.0
     raise RuntimeError(f"/proc/self/status has no {field}")
+
+
+# ---- what is timed ---------------------------------------------------------------------------------------------------
+
+STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
+
+
+def advance(sim: ds.Simulator, start: ds.State, steps: int) -> ds.State:
+    """Forward alone: no gradients recorded."""
+    with torch.no_grad():
+        return sim.rollout(start, None, steps)
+
+
+class Recorded:
+    """A rollout with gradients recorded, and a loss on its last state."""
+
+    def __init__(self, sim: ds.Simulator, start: ds.State, steps: int) -> None:
+        fields = {name: getattr(start, name).detach() for name in STATE_FIELDS}
+        self.inputs = [t.requires_grad_() for t in fields.values() if t.numel()]
+        self.inputs.append(sim.mass.requires_grad_())
+        final = sim.rollout(ds.State(**fields), None, steps)[-1]
+        self.loss = sum((getattr(final, name).square().sum() for name in STATE_FIELDS), torch.zeros(()))
+
+    def backward(self) -> tuple[Tensor, ...]:
+        """The gradient with respect to the initial state and the masses; as often as wanted."""
+        return torch.autograd.grad(self.loss, self.inputs, retain_graph=True)
+
+
+def differentiate(sim: ds.Simulator, start: ds.State, steps: int) -> tuple[Tensor, ...]:
+    """Forward and backward."""
+    return Recorded(sim, start, steps).backward()

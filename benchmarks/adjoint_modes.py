@@ -9,7 +9,6 @@ and what a backward of each mode takes.
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import sys
@@ -17,7 +16,7 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from _common import in_turns, print_header, print_row
+from _common import in_turns, make_parser, print_header, print_row
 from torch import Tensor
 
 import diffsim as ds
@@ -87,10 +86,12 @@ def gap(gradient: Tensor, exact: Tensor) -> float:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--losses", type=int, default=16, help="random losses per scene (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=21, help="of timing (default: %(default)s)")
     options = parser.parse_args()
+    if options.quick:
+        options.losses, options.rounds = 1, 1
     torch.set_num_threads(1)
     print_header()
     print(",".join(COLUMNS))

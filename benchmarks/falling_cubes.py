@@ -13,7 +13,6 @@ stiff. Needs the extra `bench`.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import statistics
 import sys
@@ -24,11 +23,19 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any, ClassVar
 
-import mujoco
-import mujoco.rollout
-import numpy as np
 import torch
-from _common import added_memory, in_turns, median_ratio, print_header, print_row, slope
+from _common import (
+    added_memory,
+    advance,
+    differentiate,
+    in_turns,
+    make_parser,
+    median_ratio,
+    print_header,
+    print_row,
+    slope,
+)
+from _mujoco import CONES, boxes, faster, ways_to_step
 
 import diffsim as ds
 from diffsim import _core, scenes
@@ -37,25 +44,10 @@ from diffsim.ops import RolloutCall, rollout
 COUNTS = (20, 100, 200, 300, 1000)
 DT, STEPS = 0.01, 200
 DROP, STRIDE, DENSITY = 0.5, 2.0, 1000.0
-CONES = ("pyramidal", "elliptic")
 TIMES = ("forward_s", "forward_backward_s", "mujoco_pyramidal_s", "mujoco_elliptic_s")
 RATIOS = tuple(f"{ours}_to_{cone}" for ours in ("forward", "forward_backward") for cone in CONES)
 COLUMNS = ("cubes", "steps", *TIMES, *RATIOS)
 COLUMNS += ("tape_bytes_per_cube_step", "memory_mb", "mujoco_memory_mb", "rest_gap_m")
-
-
-def differentiate(sim: ds.Simulator, start: ds.State) -> tuple[torch.Tensor, ...]:
-    fields = (start.position, start.orientation, start.velocity, start.angular_velocity)
-    inputs = [t.detach().requires_grad_() for t in fields]
-    final = sim.rollout(ds.State(*inputs), None, STEPS)[-1]
-    loss = final.position.square().sum() + final.orientation.square().sum()
-    loss = loss + final.velocity.square().sum() + final.angular_velocity.square().sum()
-    return torch.autograd.grad(loss, [*inputs, sim.mass])
-
-
-def advance(sim: ds.Simulator, start: ds.State) -> ds.State:
-    with torch.no_grad():
-        return sim.rollout(start, None, STEPS)
 
 
 def tape_bytes(sim: ds.Simulator, start: ds.State) -> int:
@@ -66,36 +58,6 @@ def tape_bytes(sim: ds.Simulator, start: ds.State) -> int:
     rollout(call, *inputs, *no_cloth_nor_controls, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
     assert isinstance(call.tape, _core.Tape)
     return call.tape.nbytes
-
-
-def mujoco_model(count: int, cone: str) -> Any:
-    """The scene of `scenes.falling_cubes`, its positions included."""
-    side = int(np.ceil(np.sqrt(count)))
-    bodies = [
-        f'<body pos="{STRIDE * (k % side)} {STRIDE * (k // side)} {DROP + 0.5}"><freejoint/>'
-        f'<geom type="box" size=".5 .5 .5" density="{DENSITY}"/></body>'
-        for k in range(count)
-    ]
-    text = f"""<mujoco><option timestep="{DT}" cone="{cone}"/><worldbody>
-        <geom type="plane" size="0 0 1"/>{"".join(bodies)}</worldbody></mujoco>"""
-    return mujoco.MjModel.from_xml_string(text)
-
-
-def mujoco_runs(model: Any) -> dict[str, Callable[[], object]]:
-    """Two ways to take the same steps in C from the same start."""
-    data = mujoco.MjData(model)
-    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
-    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-
-    def by_mj_step() -> object:
-        mujoco.mj_resetData(model, data)
-        mujoco.mj_step(model, data, nstep=STEPS)
-        return data
-
-    def by_rollout() -> object:
-        return mujoco.rollout.rollout(model, data, state, nstep=STEPS)
-
-    return {"mj_step": by_mj_step, "rollout": by_rollout}
 
 
 class Worker:
@@ -112,20 +74,25 @@ class Worker:
         def make_and_differentiate() -> None:
             scene = scenes.falling_cubes(count, drop=DROP, stride=STRIDE, density=DENSITY)
             made["sim"] = ds.Simulator(scene, dt=DT, num_threads=1, on_failure="raise")
-            made["sim"].mass.requires_grad_()
             made["start"] = made["sim"].initial_state()
-            differentiate(made["sim"], made["start"])
+            differentiate(made["sim"], made["start"], STEPS)
 
-        facts = {
-            "memory_mb": added_memory(make_and_differentiate),
-            "mujoco_memory_mb": added_memory(lambda: mujoco_runs(mujoco_model(count, CONES[0]))["mj_step"]()),
-        }
+        facts = {"memory_mb": added_memory(make_and_differentiate)}
         sim, start = made["sim"], made["start"]
-        facts["rest_gap_m"] = float((advance(sim, start).position[-1, :, 2] - 0.5).abs().max())
+
+        def mujoco_runs(cone: str) -> dict[str, Callable[[], object]]:
+            model, data = boxes(start.position.numpy(), 1.0, dt=DT, density=DENSITY, cone=cone)
+            return ways_to_step(model, data, STEPS)
+
+        facts["mujoco_memory_mb"] = added_memory(lambda: mujoco_runs(CONES[0])["mj_step"]())
+        facts["rest_gap_m"] = float((advance(sim, start, STEPS).position[-1, :, 2] - 0.5).abs().max())
         facts["tape_bytes_per_cube_step"] = tape_bytes(sim, start) / (count * STEPS)
-        cls.cases = {"forward": partial(advance, sim, start), "forward_backward": partial(differentiate, sim, start)}
+        cls.cases = {
+            "forward": partial(advance, sim, start, STEPS),
+            "forward_backward": partial(differentiate, sim, start, STEPS),
+        }
         for cone in CONES:
-            for name, run in mujoco_runs(mujoco_model(count, cone)).items():
+            for name, run in mujoco_runs(cone).items():
                 cls.cases[f"mujoco_{cone} {name}"] = run
         for call in cls.cases.values():
             call()
@@ -140,8 +107,7 @@ class Worker:
 def row_of(count: int, facts: dict[str, float], rounds: list[dict[str, float]]) -> dict[str, float]:
     seconds = {name: [measured[name] for measured in rounds] for name in rounds[0]}
     for cone in CONES:
-        ways = [values for name, values in seconds.items() if name.startswith(f"mujoco_{cone} ")]
-        seconds[f"mujoco_{cone}"] = min(ways, key=statistics.median)
+        seconds[f"mujoco_{cone}"] = faster(seconds, f"mujoco_{cone} ")
     row = {"cubes": count, "steps": STEPS, **facts}
     row.update({f"{name}_s": statistics.median(values) for name, values in seconds.items()})
     for ours in ("forward", "forward_backward"):
@@ -150,11 +116,13 @@ def row_of(count: int, facts: dict[str, float], rounds: list[dict[str, float]]) 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
     parser.add_argument("--rounds", type=int, default=11, help="of which the medians are printed")
     parser.add_argument("--cpu-time", action="store_true", help="time on the processor instead of wall time")
     options = parser.parse_args()
+    if options.quick:
+        options.counts, options.rounds = [4, 9], 1
     clock = time.process_time if options.cpu_time else time.perf_counter
     print_header("mujoco")
     print_row(COLUMNS)

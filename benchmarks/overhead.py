@@ -7,7 +7,6 @@ Prints one CSV line per run; the ratios should be at most 2.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from _common import in_turns, print_header, print_row
+from _common import in_turns, make_parser, print_header, print_row
 from torch import Tensor
 
 import diffsim as ds
@@ -66,16 +65,18 @@ def repeated(call: Callable[[], object], repeats: int) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=21, help="per run; the median of them is printed")
     parser.add_argument("--repeats", type=int, default=500, help="calls per round")
     options = parser.parse_args()
+    if options.quick:
+        options.runs, options.rounds, options.repeats = 1, 3, 20
     torch.set_num_threads(1)
     timed = {name: partial(repeated, call, options.repeats) for name, call in cases().items()}
     print_header()
     print_row(COLUMNS)
-    for run in range(options.runs):
+    for run in range(1, options.runs + 1):
         seconds = in_turns(timed, options.rounds)
         us = {name: 1e6 * statistics.median(values) / options.repeats for name, values in seconds.items()}
         values: list[float] = []

@@ -1,0 +1,63 @@
+"""MuJoCo's side of the benchmarks of boxes on a plane; its steps are looped over in C."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from numpy.typing import ArrayLike
+
+CONES = ("pyramidal", "elliptic")
+_START = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+def boxes(
+    position: ArrayLike,
+    edge: float,
+    *,
+    dt: float,
+    cone: str = "pyramidal",
+    gravity: float = 9.81,
+    density: float = 1000.0,
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> tuple[Any, Any]:
+    """Model and data of upright cubes with these centres above the plane z = 0, all moving alike. Default options."""
+    half = 0.5 * edge
+    bodies = [
+        f'<body pos="{x} {y} {z}"><freejoint/><geom type="box" size="{half} {half} {half}" density="{density}"/></body>'
+        for x, y, z in np.asarray(position).tolist()
+    ]
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="{dt}" cone="{cone}" gravity="0 0 {-gravity}"/><worldbody>
+        <geom type="plane" size="0 0 1"/>{"".join(bodies)}</worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    data.qvel.reshape(-1, 6)[:, :3] = velocity
+    return model, data
+
+
+def ways_to_step(model: Any, data: Any, steps: int) -> dict[str, Callable[[], object]]:
+    """Two ways to take the same steps, over and over from where `data` is now, with its warm start."""
+    state = np.zeros(mujoco.mj_stateSize(model, _START))
+    mujoco.mj_getState(model, data, state, _START)
+    warm = data.qacc_warmstart.copy()
+
+    def by_mj_step() -> object:
+        mujoco.mj_setState(model, data, state, _START)
+        data.qacc_warmstart[:] = warm
+        mujoco.mj_step(model, data, nstep=steps)
+        return data
+
+    def by_rollout() -> object:
+        return mujoco.rollout.rollout(model, data, state, nstep=steps, initial_warmstart=warm)
+
+    return {"mj_step": by_mj_step, "rollout": by_rollout}
+
+
+def faster(seconds: Mapping[str, list[float]], prefix: str) -> list[float]:
+    """The times of the faster of the cases whose names begin so."""
+    return min((values for name, values in seconds.items() if name.startswith(prefix)), key=statistics.median)
