@@ -22,12 +22,21 @@ from torch import Tensor
 import diffsim as ds
 
 Result = TypeVar("Result")
+Clock = Callable[[], float]  # seconds
 
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:
     """With what every benchmark understands."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a smoke run of a few seconds; its numbers mean nothing")
+    parser.add_argument(
+        "--cpu-time",
+        dest="clock",
+        action="store_const",
+        const=time.process_time,
+        default=time.perf_counter,
+        help="time on the processor instead of wall time: for machines that others use, too",
+    )
     return parser
 
 
@@ -50,13 +59,14 @@ def installed_version(distribution: str) -> str:
         return "not installed"
 
 
-def print_header(*distributions: str) -> None:
-    """Comment lines: machine, and versions of Python, of diffsim and of what else is named."""
+def print_header(*distributions: str, clock: Clock) -> None:
+    """Comment lines: machine, versions of Python, of diffsim and of what else is named, and what times are."""
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     print(f"# {processor()}, {os.cpu_count()} cores{load}, {platform.system()} {platform.release()}")
     versions = [f"Python {platform.python_version()}"]
     versions += [f"{name} {installed_version(name)}" for name in ("mesh-diffsim", "torch", "numpy", *distributions)]
     print("#", ", ".join(versions))
+    print("# times:", "on the processor" if clock is time.process_time else "wall")
 
 
 def print_row(values: Iterable[object]) -> None:
@@ -97,7 +107,7 @@ def draw_curves(
 
 
 def in_turns(
-    cases: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = time.perf_counter
+    cases: Mapping[str, Callable[[], object]], rounds: int, clock: Clock = time.perf_counter
 ) -> dict[str, list[float]]:
     """Seconds each case took, round after round: what slows the machine down for a while hits all of them."""
     seconds: dict[str, list[float]] = {name: [] for name in cases}

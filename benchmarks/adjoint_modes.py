@@ -93,7 +93,7 @@ def main() -> int:
     if options.quick:
         options.losses, options.rounds = 1, 1
     torch.set_num_threads(1)
-    print_header()
+    print_header(clock=options.clock)
     print(",".join(COLUMNS))
     for name, build in SCENES.items():
         cases = {mode: Case(build, mode) for mode in MODES}
@@ -108,7 +108,7 @@ def main() -> int:
         sim = cases["exact"].sim
         wrt = ("position", "orientation", "velocity", "angular_velocity", "mass", "inertia")
         report = ds.diagnostics.gradcheck(sim, sim.initial_state(), steps=STEPS, wrt=wrt, directions=8)
-        seconds = in_turns({mode: partial(cases[mode].gradient, 0) for mode in MODES}, options.rounds)
+        seconds = in_turns({mode: partial(cases[mode].gradient, 0) for mode in MODES}, options.rounds, options.clock)
         stable = f"{len(report.stable)} of {len(report.directions)}"
         times = [1e3 * statistics.median(seconds[mode]) for mode in MODES]
         print_row([name, contact_steps(build), *columns, report.median_error, report.max_error, stable, *times])

@@ -16,7 +16,6 @@ from __future__ import annotations
 import multiprocessing
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
@@ -25,6 +24,7 @@ from typing import Any, ClassVar
 
 import torch
 from _common import (
+    Clock,
     added_memory,
     advance,
     differentiate,
@@ -99,7 +99,7 @@ class Worker:
         return facts
 
     @classmethod
-    def measure(cls, clock: Callable[[], float]) -> dict[str, float]:
+    def measure(cls, clock: Clock) -> dict[str, float]:
         """Seconds each case takes."""
         return {name: values[0] for name, values in in_turns(cls.cases, 1, clock).items()}
 
@@ -119,12 +119,10 @@ def main() -> int:
     parser = make_parser(__doc__)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
     parser.add_argument("--rounds", type=int, default=11, help="of which the medians are printed")
-    parser.add_argument("--cpu-time", action="store_true", help="time on the processor instead of wall time")
     options = parser.parse_args()
     if options.quick:
-        options.counts, options.rounds = [4, 9], 1
-    clock = time.process_time if options.cpu_time else time.perf_counter
-    print_header("mujoco")
+        options.counts, options.rounds = [4], 1
+    print_header("mujoco", clock=options.clock)
     print_row(COLUMNS)
     rounds: dict[int, list[dict[str, float]]] = {count: [] for count in options.counts}
     with ExitStack() as stack:
@@ -133,7 +131,7 @@ def main() -> int:
         facts = {count: worker.submit(Worker.prepare, count).result() for count, worker in workers.items()}
         for _ in range(options.rounds):  # the numbers of cubes take turns, too, for the sake of the slopes
             for count, worker in workers.items():
-                rounds[count].append(worker.submit(Worker.measure, clock).result())
+                rounds[count].append(worker.submit(Worker.measure, options.clock).result())
     rows = [row_of(count, facts[count], rounds[count]) for count in options.counts]
     for row in rows:
         print_row(row[name] for name in COLUMNS)

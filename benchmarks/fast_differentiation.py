@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from _common import (
     STATE_FIELDS,
+    Clock,
     Recorded,
     added_memory,
     advance,
@@ -90,25 +91,27 @@ def central_differences(sim: ds.Simulator, state: ds.State) -> float:
     return report.median_error
 
 
-def measure_mode(count: int, mode: str, arrays: list[np.ndarray], rounds: int) -> tuple[dict[str, Any], np.ndarray]:
+def measure_mode(
+    count: int, mode: str, arrays: list[np.ndarray], rounds: int, clock: Clock
+) -> tuple[dict[str, Any], np.ndarray]:
     """In a fresh process: a backward through one resting step, and its gradient."""
     torch.set_num_threads(1)
     recorded = Recorded(simulator(count, mode), at_rest(arrays), 1)
     gradient: list[torch.Tensor] = []
     row = {"memory_mb": added_memory(lambda: gradient.extend(recorded.backward()))}
-    seconds = in_turns({mode: recorded.backward}, rounds)[mode]
+    seconds = in_turns({mode: recorded.backward}, rounds, clock)[mode]
     row["backward_ms"] = 1e3 * statistics.median(seconds)
     return row, np.concatenate([t.numpy().ravel() for t in gradient])
 
 
-def measure_steps(count: int, arrays: list[np.ndarray], rounds: int) -> dict[str, Any]:
+def measure_steps(count: int, arrays: list[np.ndarray], rounds: int, clock: Clock) -> dict[str, Any]:
     """In a fresh process: steps at rest and at landing, and MuJoCo's, in turns."""
     torch.set_num_threads(1)
     sim, state = simulator(count, "exact"), at_rest(arrays)
     start = sim.initial_state()
     trajectory = [start, *advance(sim, start, LANDING)]
     landing = {str(k): partial(advance, sim, trajectory[k], 1) for k in range(LANDING)}
-    seconds = in_turns(landing, 2)
+    seconds = in_turns(landing, 2, clock)
     dearest = max(landing, key=lambda k: min(seconds[k]))
     cases: dict[str, Any] = {
         "forward": partial(advance, sim, state, REPEATS),
@@ -123,7 +126,7 @@ def measure_steps(count: int, arrays: list[np.ndarray], rounds: int) -> dict[str
             cases[f"mujoco {cone} {way}"] = call
     for call in cases.values():
         call()
-    seconds = in_turns(cases, rounds)
+    seconds = in_turns(cases, rounds, clock)
     mujoco = faster(seconds, "mujoco ")
     row = {
         "forward_ms": 1e3 * statistics.median(seconds["forward"]) / REPEATS,
@@ -171,8 +174,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
-        options.counts, options.rounds = [6, 12], 1
-    print_header("mujoco")
+        options.counts, options.rounds = [8], 1
+    print_header("mujoco", clock=options.clock)
     print_row(COLUMNS)
     rows = []
     for count in options.counts:
@@ -185,8 +188,8 @@ def main() -> int:
                 print(f"# {mode} at {cubes} cubes left out: about {seconds:.0f} s and {megabytes:.0f} MB")
                 continue
             rounds = 1 if seconds > 5.0 else options.rounds
-            found[mode], gradients[mode] = in_fresh_process(measure_mode, count, mode, arrays, rounds)
-        steps = in_fresh_process(measure_steps, count, arrays, options.rounds)
+            found[mode], gradients[mode] = in_fresh_process(measure_mode, count, mode, arrays, rounds, options.clock)
+        steps = in_fresh_process(measure_steps, count, arrays, options.rounds, options.clock)
         found["exact"].update(steps)
         if "dense" in found and "qr" in found:
             gap = np.linalg.norm(gradients["dense"] - gradients["qr"]) / np.linalg.norm(gradients["qr"])

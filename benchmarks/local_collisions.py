@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 from _common import (
+    Clock,
     Recorded,
     added_memory,
     advance,
@@ -50,7 +51,7 @@ COLUMNS = ("cubes", "step", "contacts", "mode", "local_ms", "global_ms", "global
 COLUMNS += ("local_memory_mb", "global_memory_mb", "lcp_published_ms", "paper_published_ms", "paper_code_ms")
 
 
-def measure(count: int, mode: str, zones: str, rounds: int) -> dict[str, dict[str, Any]]:
+def measure(count: int, mode: str, zones: str, rounds: int, clock: Clock) -> dict[str, dict[str, Any]]:
     """In a fresh process: the backward of each of STEPS."""
     torch.set_num_threads(1)
     scene = scenes.row_of_cubes(count)
@@ -61,9 +62,9 @@ def measure(count: int, mode: str, zones: str, rounds: int) -> dict[str, dict[st
         recorded = Recorded(sim, advance(sim, start, before)[-1] if before else start, 1)
         assert sim.info is not None
         found[step] = {"contacts": sim.info.contacts, "memory_mb": added_memory(recorded.backward)}
-        seconds = in_turns({"backward": recorded.backward}, 1)["backward"]
+        seconds = in_turns({"backward": recorded.backward}, 1, clock)["backward"]
         if seconds[0] < 2.0:
-            seconds = in_turns({"backward": recorded.backward}, rounds)["backward"]
+            seconds = in_turns({"backward": recorded.backward}, rounds, clock)["backward"]
         found[step]["ms"] = 1e3 * statistics.median(seconds)
     return found
 
@@ -106,12 +107,14 @@ def main() -> int:
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds = [6], 1
-    print_header()
+    print_header(clock=options.clock)
     print_row(COLUMNS)
     rows = []
     for count in options.counts:
         for mode in MODES:
-            found = {zones: in_fresh_process(measure, count, mode, zones, options.rounds) for zones in ZONES}
+            found = {
+                zones: in_fresh_process(measure, count, mode, zones, options.rounds, options.clock) for zones in ZONES
+            }
             for step in STEPS:
                 rows.append(row_of(count, step, mode, {zones: found[zones][step] for zones in ZONES}))
                 print_row(rows[-1].get(name) for name in COLUMNS)

@@ -19,6 +19,7 @@ from typing import Any
 
 import torch
 from _common import (
+    Clock,
     added_memory,
     advance,
     differentiate,
@@ -47,8 +48,8 @@ SPACING, GROWTH = 0.15, 0.02  # of the first line [m]; what every further line a
 # - The paper's own code (2020, on torch 2.15): 0.526, 1.032, 1.776 s for a step with all cubes on the ground, times
 #   STEPS.
 OTHERS: dict[int, dict[str, float]] = {
-    20: {"mpm_s": 47.0, "mpm_memory_mb": 3900.0},
-    100: {"mpm_s": 230.0, "mpm_memory_mb": 19000.0, "paper_code_s": 52.6},
+    20: {"mpm_s": 47, "mpm_memory_mb": 3900},
+    100: {"mpm_s": 230, "mpm_memory_mb": 19000, "paper_code_s": 52.6},
     200: {"paper_code_s": 103.2},
     300: {"paper_code_s": 177.6},
 }
@@ -72,7 +73,7 @@ def build_scene(count: int) -> ds.Scene:
     return scene
 
 
-def measure(count: int, rounds: int) -> dict[str, Any]:
+def measure(count: int, rounds: int, clock: Clock) -> dict[str, Any]:
     """One row, in a fresh process."""
     torch.set_num_threads(1)
     made: dict[str, Any] = {}
@@ -95,7 +96,7 @@ def measure(count: int, rounds: int) -> dict[str, Any]:
     assert height < 0.5 * EDGE * 1.01, f"a cube is not on the ground: {height}"
     cases = {"forward": partial(advance, sim, start, STEPS), "both": partial(differentiate, sim, start, STEPS)}
     cases.update({f"mujoco {way}": call for way, call in made["mujoco"].items()})
-    seconds = in_turns(cases, rounds)
+    seconds = in_turns(cases, rounds, clock)
     mujoco = faster(seconds, "mujoco ")
     medians = (statistics.median(s) for s in (seconds["forward"], seconds["both"], mujoco))
     row.update(zip(TIMES, medians))
@@ -132,12 +133,12 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
-        options.counts, options.rounds = [4, 20], 1
-    print_header("mujoco")
+        options.counts, options.rounds = [20], 1
+    print_header("mujoco", clock=options.clock)
     print_row(COLUMNS)
     rows = []
     for count in options.counts:
-        rows.append(in_fresh_process(measure, count, options.rounds))
+        rows.append(in_fresh_process(measure, count, options.rounds, options.clock))
         print_row(rows[-1].get(name) for name in COLUMNS)
     counts = [row["objects"] for row in rows]
     slopes = (f"{name} {slope(counts, [row[name] for row in rows]):.3f}" for name in TIMES)

@@ -74,10 +74,10 @@ def main() -> int:
         options.runs, options.rounds, options.repeats = 1, 3, 20
     torch.set_num_threads(1)
     timed = {name: partial(repeated, call, options.repeats) for name, call in cases().items()}
-    print_header()
+    print_header(clock=options.clock)
     print_row(COLUMNS)
     for run in range(1, options.runs + 1):
-        seconds = in_turns(timed, options.rounds)
+        seconds = in_turns(timed, options.rounds, options.clock)
         us = {name: 1e6 * statistics.median(values) / options.repeats for name, values in seconds.items()}
         values: list[float] = []
         for direction in ("forward", "backward"):
