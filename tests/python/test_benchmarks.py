@@ -1,0 +1,70 @@
+"""The benchmarks run: every script in quick mode prints the table it promises, and nothing is said about its times."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+SCRIPTS = sorted(BENCHMARKS.glob("[a-z]*.py"))
+# Some of a script's columns, first and last among them.
+COLUMNS = {
+    "adjoint_modes": ("scene", "qr_state", "exact_error_median", "dense_backward_ms"),
+    "falling_cubes": ("cubes", "forward_s", "mujoco_elliptic_s", "memory_mb", "rest_gap_m"),
+    "fast_differentiation": ("cubes", "mode", "backward_ms", "memory_mb", "error", "backward_to_mujoco"),
+    "local_collisions": ("cubes", "step", "mode", "local_ms", "global_ms", "lcp_published_ms", "paper_code_ms"),
+    "many_objects": ("objects", "forward_backward_s", "mujoco_forward_s", "memory_mb", "mpm_s", "paper_code_s"),
+    "overhead": ("run", "nothing_forward_us", "backward_ratio"),
+    "relative_scale": ("scale", "forward_backward_s", "memory_mb", "most_iterations"),
+}
+POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times
+TEXT = ("mode", "step", "scene", "material", "name", "case", "directions", "peer", "what")
+
+for package in ("matplotlib", "mujoco"):
+    pytest.importorskip(package, reason="the benchmarks' packages: pip install .[bench]")
+
+
+def test_all_scripts_are_here() -> None:
+    assert {script.stem for script in SCRIPTS} >= set(COLUMNS)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_benchmark_prints_its_table(script: Path, tmp_path: Path) -> None:
+    if "_stage" in script.read_text(encoding="utf-8"):
+        pytest.importorskip("pymeshfix", reason="the examples' packages: pip install .[examples]")
+    command = [sys.executable, str(script), "--quick"]
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    comments = [line for line in lines if line.startswith("#")]
+    assert "cores" in comments[0]  # the machine
+    assert "mesh-diffsim" in comments[1]  # versions
+    table = csv.DictReader(line for line in lines if not line.startswith("#"))
+    rows = list(table)
+    columns = list(table.fieldnames or ())
+    assert len(set(columns)) == len(columns)
+    expected = COLUMNS.get(script.stem)
+    if expected is not None:
+        assert set(expected) <= set(columns)
+        assert (expected[0], expected[-1]) == (columns[0], columns[-1])
+    assert rows
+    for row in rows:
+        assert None not in row and None not in row.values(), row  # as many fields as columns
+        numbers = {name: text for name, text in row.items() if name not in TEXT and text}
+        assert numbers, row
+        for name, text in numbers.items():
+            value = float(text)
+            assert math.isfinite(value), (name, text)
+            assert value > 0.0 if name.endswith(POSITIVE) else value >= 0.0, (name, text)
+    filled = {name for row in rows for name, text in row.items() if text}
+    peers = {name for name in columns if "published" in name or "paper" in name or "mpm" in name}
+    assert filled >= set(columns) - peers  # only others' figures may be missing everywhere, as quick runs are small
+    for comment in comments:
+        if comment.startswith("# plot: "):
+            assert (tmp_path / comment.removeprefix("# plot: ")).stat().st_size > 5_000
