@@ -140,7 +140,8 @@ Slides<A::kSize + B::kSize> collect_slides(const ContactGeometry& geometry, cons
 
 /// Second derivative of the distance d = min over the slides s of |w(y, s)|. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹,
 /// q = n · dS/dy, and N the projector on what is orthogonal to S and n:
-///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy².
+///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy²  =  WᵀNW/d - X - Xᵀ + n · d²w/dy²,  X = (SᵀW + ½ d q)ᵀ G q.
+/// Products of these sizes are written out: what Eigen would call for them is made for large matrices, and allocates.
 template <class A, class B>
 Square<A::kSize + B::kSize> distance_hessian(const ContactGeometry& geometry, const A& a, const B& b) {
     constexpr int kSize = A::kSize + B::kSize;
@@ -156,7 +157,8 @@ Square<A::kSize + B::kSize> distance_hessian(const ContactGeometry& geometry, co
     const Slides<kSize> slides = collect_slides(geometry, a, b);
     if (slides.count == 0) {
         const Mat3 N = Mat3::Identity() - n * n.transpose();
-        hessian += W.transpose() * N * W / d;
+        const Rows3<kSize> NW = N * W;
+        hessian.noalias() += W.transpose().lazyProduct(NW / d);
         return hessian;
     }
     Eigen::Matrix<double, 2, kSize> q = Eigen::Matrix<double, 2, kSize>::Zero();
@@ -169,15 +171,16 @@ Square<A::kSize + B::kSize> distance_hessian(const ContactGeometry& geometry, co
     if (slides.count == 1) {
         const Vec3 binormal = n.cross(slides.direction[0]);
         const Eigen::Matrix<double, 1, kSize> BW = binormal.transpose() * W;
-        hessian += BW.transpose() * BW / d;
+        hessian.noalias() += (BW / d).transpose().lazyProduct(BW);
     } else {
         const double g = slides.direction[0].dot(slides.direction[1]);
         const double determinant = slides.direction[0].cross(slides.direction[1]).squaredNorm();
         G << 1.0, -g, -g, 1.0;
         G /= determinant;
     }
-    const Square<kSize> mixed = SW.transpose() * G * q;
-    hessian -= mixed + mixed.transpose() + d * (q.transpose() * G * q);
+    const Eigen::Matrix<double, 2, kSize> P = SW + 0.5 * d * q, Gq = G * q;
+    const Square<kSize> X = P.transpose().lazyProduct(Gq);
+    hessian -= X + X.transpose();
     return hessian;
 }
 
@@ -198,7 +201,7 @@ AngleDerivatives<A::kSize + B::kSize> angle_derivatives(const ContactGeometry& g
     Vector<kA + kB> g_gradient;
     g_gradient << Da.transpose() * db, Db.transpose() * da;
     Square<kA + kB> g_hessian;
-    const Eigen::Matrix<double, kA, kB> cross = Da.transpose() * Db;
+    const Eigen::Matrix<double, kA, kB> cross = Da.transpose().lazyProduct(Db);
     g_hessian << a.direction_curvature(da, db), cross, cross.transpose(), b.direction_curvature(db, da);
     return {-2.0 * g * g_gradient, -2.0 * (g_gradient * g_gradient.transpose() + g * g_hessian)};
 }
