@@ -3,14 +3,10 @@
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
 #include <algorithm>
-#include <atomic>
 #include <chrono>
 #include <cmath>
-#include <exception>
-#include <mutex>
 #include <sstream>
 #include <stdexcept>
-#include <thread>
 
 #include "math/rotation.hpp"
 #include "scene_queries.hpp"
@@ -30,32 +26,23 @@ Eigen::Map<Eigen::Matrix<double, Rows, 1>> row(double* data, int index) {
     return Eigen::Map<Eigen::Matrix<double, Rows, 1>>(data + Rows * index);
 }
 
-/// Call work(scene, thread) for every scene, on several threads if there are several scenes. The first exception, by
-/// scene, is thrown on.
+/// From how many bodies and nodes on threads are better used inside a scene than left idle for want of scenes.
+constexpr int kBigScene = 256;
+
+/// Call work(scene, workspace) for every scene. Threads divide the scenes among themselves where there is one for each of
+/// them, else, where scenes are big, the bodies and zones of one scene after the other. The first exception, by scene, is
+/// thrown on.
 template <typename Work>
-void for_each_scene(int batch, int thread_count, const Work& work) {
-    thread_count = std::min(thread_count, batch);
-    if (thread_count <= 1) {
-        for (int scene = 0; scene < batch; ++scene) work(scene, 0);
-        return;
-    }
-    std::atomic<int> next{0};
-    std::vector<std::exception_ptr> errors(static_cast<std::size_t>(batch));
-    const auto run = [&](int thread) {
-        for (int scene = next++; scene < batch; scene = next++) {
-            try {
-                work(scene, thread);
-            } catch (...) {
-                errors[scene] = std::current_exception();
-            }
-        }
-    };
-    std::vector<std::thread> threads;
-    for (int t = 1; t < thread_count; ++t) threads.emplace_back(run, t);
-    run(0);
-    for (std::thread& thread : threads) thread.join();
-    for (const std::exception_ptr& error : errors)
-        if (error) std::rethrow_exception(error);
+void for_each_scene(const Model& model, int batch, int thread_count, const Work& work) {
+    const bool one_by_one =
+        batch < thread_count && (batch == 1 || model.body_count() + model.node_count() >= kBigScene);
+    Workers workers(one_by_one ? 1 : std::min(batch, thread_count));
+    std::vector<std::unique_ptr<StepWorkspace>> workspaces(static_cast<std::size_t>(workers.thread_count()));
+    workers.for_each_range(batch, 1, [&](int begin, int end, int thread) {
+        std::unique_ptr<StepWorkspace>& workspace = workspaces[thread];
+        if (!workspace) workspace = std::make_unique<StepWorkspace>(one_by_one ? thread_count : 1);
+        for (int scene = begin; scene < end; ++scene) work(scene, *workspace);
+    });
 }
 
 // --- inputs --------------------------------------------------------------------------------------------------------
@@ -197,7 +184,8 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
 }
 
 void read_control(
-    const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state, SceneControl& control) {
+    const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state, Workers& workers,
+    SceneControl& control) {
     control.bodies.resize(model.bodies.size());
     const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise) {
         if (!view.present()) return otherwise;
@@ -206,26 +194,30 @@ void read_control(
         return value;
     };
     const Vec3 zero = Vec3::Zero();
-    for (int i = 0; i < model.body_count(); ++i) {
-        BodyControl& body = control.bodies[i];
-        body.force = read("control.force", in.force, i, zero);
-        body.torque = read("control.torque", in.torque, i, zero);
-        body.velocity = read("control.body_velocity", in.body_velocity, i, state.bodies[i].velocity);
-        body.angular_velocity =
-            read("control.body_angular_velocity", in.body_angular_velocity, i, state.bodies[i].angular_velocity);
-    }
+    workers.for_each_range(model.body_count(), kBodiesARange, [&](int begin, int end, int) {
+        for (int i = begin; i < end; ++i) {
+            BodyControl& body = control.bodies[i];
+            body.force = read("control.force", in.force, i, zero);
+            body.torque = read("control.torque", in.torque, i, zero);
+            body.velocity = read("control.body_velocity", in.body_velocity, i, state.bodies[i].velocity);
+            body.angular_velocity =
+                read("control.body_angular_velocity", in.body_angular_velocity, i, state.bodies[i].angular_velocity);
+        }
+    });
     if (model.cloths.empty()) return;
     read_nodes("control.node_force", model, in.node_force, time, scene, control.node_force);
     read_nodes("control.node_velocity", model, in.node_drive, time, scene, control.node_velocity);
 }
 
-void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene) {
-    for (int i = 0; i < static_cast<int>(state.bodies.size()); ++i) {
-        row<3>(out.position.at(time, scene), i) = state.bodies[i].position;
-        row<4>(out.orientation.at(time, scene), i) = state.bodies[i].orientation;
-        row<3>(out.velocity.at(time, scene), i) = state.bodies[i].velocity;
-        row<3>(out.angular_velocity.at(time, scene), i) = state.bodies[i].angular_velocity;
-    }
+void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene, Workers& workers) {
+    workers.for_each_range(static_cast<int>(state.bodies.size()), kBodiesARange, [&](int begin, int end, int) {
+        for (int i = begin; i < end; ++i) {
+            row<3>(out.position.at(time, scene), i) = state.bodies[i].position;
+            row<4>(out.orientation.at(time, scene), i) = state.bodies[i].orientation;
+            row<3>(out.velocity.at(time, scene), i) = state.bodies[i].velocity;
+            row<3>(out.angular_velocity.at(time, scene), i) = state.bodies[i].angular_velocity;
+        }
+    });
     for (int i = 0; i < static_cast<int>(state.node_position.size()); ++i) {
         row<3>(out.node_position.at(time, scene), i) = state.node_position[i];
         row<3>(out.node_velocity.at(time, scene), i) = state.node_velocity[i];
@@ -255,18 +247,20 @@ struct SceneGradient {
 };
 
 void add_upstream(
-    const TrajectoryArrays<const double>& upstream, int time, int scene, const SceneState& end,
+    const TrajectoryArrays<const double>& upstream, int time, int scene, const SceneState& state, Workers& workers,
     SceneStateGradient& gradient) {
-    for (int i = 0; i < static_cast<int>(gradient.bodies.size()); ++i) {
-        BodyStateGradient& g = gradient.bodies[i];
-        if (upstream.position.present()) g.position += row<3>(upstream.position.at(time, scene), i);
-        if (upstream.velocity.present()) g.velocity += row<3>(upstream.velocity.at(time, scene), i);
-        if (upstream.angular_velocity.present())
-            g.angular_velocity += row<3>(upstream.angular_velocity.at(time, scene), i);
-        if (upstream.orientation.present())
-            g.orientation += quaternion_gradient_to_covector(
-                end.bodies[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
-    }
+    workers.for_each_range(static_cast<int>(gradient.bodies.size()), kBodiesARange, [&](int begin, int end, int) {
+        for (int i = begin; i < end; ++i) {
+            BodyStateGradient& g = gradient.bodies[i];
+            if (upstream.position.present()) g.position += row<3>(upstream.position.at(time, scene), i);
+            if (upstream.velocity.present()) g.velocity += row<3>(upstream.velocity.at(time, scene), i);
+            if (upstream.angular_velocity.present())
+                g.angular_velocity += row<3>(upstream.angular_velocity.at(time, scene), i);
+            if (upstream.orientation.present())
+                g.orientation += quaternion_gradient_to_covector(
+                    state.bodies[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
+        }
+    });
     for (int i = 0; i < static_cast<int>(gradient.node_position.size()); ++i) {
         if (upstream.node_position.present())
             gradient.node_position[i] += row<3>(upstream.node_position.at(time, scene), i);
@@ -275,11 +269,8 @@ void add_upstream(
     }
 }
 
-/// State at the end of a recorded step: the start of the next one, or for the last step the same arithmetic again.
-SceneState end_state(const Tape& tape, int scene, int time) {
-    const std::vector<StepRecord>& records = tape.records[scene];
-    if (time + 1 < static_cast<int>(records.size())) return records[time + 1].start;
-    const StepRecord& record = records[time];
+/// State at the end of a recorded step, by the same arithmetic again: of orientations alone.
+SceneState end_state(const StepRecord& record) {
     SceneState end = record.start;
     if (record.held) return end;
     for (std::size_t i = 0; i < end.bodies.size(); ++i) {
@@ -306,7 +297,7 @@ GradientNeeds step_needs(const RolloutArrays<double>& wanted, int time) {
 
 SceneGradient scene_backward(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
-    const RolloutArrays<double>& wanted, int scene, bool keep_controls) {
+    const RolloutArrays<double>& wanted, int scene, bool keep_controls, StepWorkspace& workspace) {
     const Model& model = *tape.model;
     const std::size_t count = model.bodies.size(), node_count = static_cast<std::size_t>(model.node_count());
     const Parameters parameters = read_parameters(model, inputs, scene);
@@ -318,16 +309,18 @@ SceneGradient scene_backward(
     gradient.parameters.mass.assign(count, 0.0);
     gradient.parameters.inertia.assign(count, Mat3::Zero());
     gradient.parameters.cloths.assign(model.cloths.size(), ClothParameters{});
-    StepWorkspace workspace;
     SceneControl control;
     SceneControlGradient scratch;
+    const std::vector<StepRecord>& records = tape.records[scene];
+    const SceneState final_state = end_state(records.back());
     for (int time = tape.shape.steps - 1; time >= 0; --time) {
         const bool last = time == tape.shape.steps - 1;
         if (tape.shape.keep_time || last)
             add_upstream(
-                upstream, tape.shape.keep_time ? time : 0, scene, end_state(tape, scene, time), gradient.state);
-        const StepRecord& record = tape.records[scene][time];
-        read_control(model, inputs, time, scene, record.start, control);
+                upstream, tape.shape.keep_time ? time : 0, scene, last ? final_state : records[time + 1].start,
+                workspace.workers, gradient.state);
+        const StepRecord& record = records[time];
+        read_control(model, inputs, time, scene, record.start, workspace.workers, control);
         SceneControlGradient& control_gradient = keep_controls ? gradient.control[time] : scratch;
         control_gradient.bodies.assign(count, BodyControl{});
         control_gradient.node_force.assign(node_count, Vec3::Zero());
@@ -435,16 +428,15 @@ RolloutInfo rollout(
     }
     signatures.assign(static_cast<std::size_t>(shape.steps) * static_cast<std::size_t>(shape.batch), 0);
     std::vector<RolloutInfo> infos(static_cast<std::size_t>(shape.batch));
-    const auto advance = [&](int scene) {
+    const auto advance = [&](int scene, StepWorkspace& workspace) {
         SceneState state = read_state(*model, inputs, scene);
         refuse_crossing(*model, state);
         const Parameters parameters = read_parameters(*model, inputs, scene);
-        StepWorkspace workspace;
         SceneControl control;
         RolloutInfo& info = infos[scene];
         for (int time = 0; time < shape.steps; ++time) {
             located(shape.controls_have_time, "step", shape.first_step + time, [&] {
-                read_control(*model, inputs, time, scene, state, control);
+                read_control(*model, inputs, time, scene, state, workspace.workers, control);
             });
             StepRecord* record = tape != nullptr ? &tape->records[scene][time] : nullptr;
             try {
@@ -458,12 +450,12 @@ RolloutInfo rollout(
             signatures
                 [static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +
                  static_cast<std::size_t>(scene)] = info.last.signature;
-            if (shape.keep_time) write_state(state, trajectory, time, scene);
+            if (shape.keep_time) write_state(state, trajectory, time, scene, workspace.workers);
         }
-        if (!shape.keep_time) write_state(state, trajectory, 0, scene);
+        if (!shape.keep_time) write_state(state, trajectory, 0, scene, workspace.workers);
     };
-    for_each_scene(shape.batch, thread_count, [&](int scene, int) {
-        located(shape.batch > 1, "scene", scene, [&] { advance(scene); });
+    for_each_scene(*model, shape.batch, thread_count, [&](int scene, StepWorkspace& workspace) {
+        located(shape.batch > 1, "scene", scene, [&] { advance(scene, workspace); });
     });
     RolloutInfo total;
     for (const RolloutInfo& info : infos) {
@@ -484,8 +476,8 @@ void rollout_backward(
     const bool keep_controls = gradient.force.present() || gradient.torque.present() || gradient.node_force.present() ||
                                gradient.body_velocity.present() || gradient.body_angular_velocity.present() ||
                                gradient.node_drive.present();
-    for_each_scene(tape.shape.batch, thread_count, [&](int scene, int) {
-        scenes[scene] = scene_backward(tape, inputs, upstream, gradient, scene, keep_controls);
+    for_each_scene(*tape.model, tape.shape.batch, thread_count, [&](int scene, StepWorkspace& workspace) {
+        scenes[scene] = scene_backward(tape, inputs, upstream, gradient, scene, keep_controls, workspace);
     });
     // Inputs that scenes share get the sum over the scenes, in their order.
     for (int scene = 0; scene < tape.shape.batch; ++scene) write_gradient(tape, inputs, gradient, scene, scenes[scene]);

@@ -13,7 +13,9 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxBlocked = 2;  // shortenings of a blocked drive before it is stopped
+constexpr int kMaxBlocked = 2;     // shortenings of a blocked drive before it is stopped
+constexpr int kWorthSharing = 64;  // bodies and nodes to be solved for: fewer are done before a thread has woken up
+constexpr int kPortionsPerThread = 32;  // of the groups: they take differently long
 
 using Clock = std::chrono::steady_clock;
 
@@ -63,13 +65,35 @@ double sagitta(const Vec6& motion, double radius) {
     return radius * std::min(0.125 * motion.head<3>().squaredNorm(), 2.0);
 }
 
+/// Objects to be solved together: their places in ForwardScratch::members.
+struct Group {
+    int root;  ///< the smallest of them
+    int first, end;
+};
+
 /// What solving one group of bodies gave. Kept at the group's smallest body.
 struct GroupOutcome {
     bool solved = false;  ///< by a zone; otherwise the bodies move freely
     ZoneResult result;
-    int first_contact = 0, contact_end = 0;  ///< active contacts, in ForwardScratch::contacts
+    int thread = 0;                          ///< that solved it
+    int first_contact = 0, contact_end = 0;  ///< active contacts, in that thread's GroupResults
     double max_compression = 0.0;
     std::uint64_t signature = 0;
+};
+
+/// A kinematic body that did not reach its target.
+struct BlockedDrive {
+    int group;  ///< that was in its way
+    int body;
+    Vec6 reached;
+};
+
+/// What one thread collects of the groups it solves.
+struct alignas(64) GroupResults {   // of cache lines of its own
+    std::vector<Contact> contacts;  ///< active, group after group
+    std::vector<double> shifts;     ///< of their rest distances
+    std::vector<BlockedDrive> blocked;
+    std::vector<int> near;
 };
 
 }  // namespace
@@ -91,11 +115,10 @@ struct StepWorkspace::ForwardScratch {
     std::vector<int> dynamic;              ///< the dynamic bodies
     std::vector<int> movers;               ///< the objects that yield: the dynamic bodies and the cloths
     std::vector<int> members, member_end;  ///< movers sorted by group; where each group ends, by smallest object
-    std::vector<Box> boxes, zone_visited;
-    std::vector<Contact> contacts;              ///< active, group after group
-    std::vector<double> shifts;                 ///< of their rest distances
-    std::vector<std::pair<int, Vec6>> blocked;  ///< kinematic bodies that did not reach their targets: where they are
-    std::vector<int> near;
+    std::vector<Box> boxes;
+    std::vector<Group> to_solve;
+    std::vector<GroupResults> results;  ///< one per thread
+    std::vector<BlockedDrive> blocked;
     std::vector<int> zone_bodies, zone_body_end, zone_cloths, zone_cloth_end, zone_contact_end;  ///< as in StepRecord
     std::vector<Contact> zone_contacts;
     std::vector<double> zone_shifts;
@@ -154,23 +177,28 @@ private:
         m.rotation.resize(static_cast<std::size_t>(count));
         m.y.resize(static_cast<std::size_t>(count), static_cast<std::size_t>(m_model.node_count()));
         m.bodies.resize(static_cast<std::size_t>(count));
+        m_workspace.workers.for_each_range(count, kBodiesARange, [&](int begin, int end, int) {
+            for (int i = begin; i < end; ++i) predict_body(i);
+        });
         m.dynamic.clear();
-        for (int i = 0; i < count; ++i) {
-            const BodyControl& control = m_control.bodies[i];
-            m.rotation[i] = {Vec3::Zero(), Vec3::Zero(), 1};
-            m.y.bodies[i].setZero();
-            if (body(i).kind == BodyKind::kinematic)
-                m.y.bodies[i] << m_options.dt * control.angular_velocity, m_options.dt * control.velocity;
-            if (!body(i).is_dynamic()) continue;
-            const Mat3 R = quaternion_to_matrix(m_state.bodies[i].orientation);
-            m.rotation[i] = free_rotation(
-                R, m_state.bodies[i].angular_velocity, control.torque, m_parameters.inertia[i], m_options.dt);
-            m.bodies[i] = moving_body(i, m_state.bodies[i], control, m_parameters, m.rotation[i], m_options.dt);
-            m.y.bodies[i] = m.bodies[i].target;
-            m.dynamic.push_back(i);
-        }
+        for (int i = 0; i < count; ++i)
+            if (body(i).is_dynamic()) m.dynamic.push_back(i);
         m.movers = m.dynamic;
         for (int c = 0; c < m_model.cloth_count(); ++c) m.movers.push_back(count + c);
+    }
+
+    void predict_body(int i) {
+        const BodyControl& control = m_control.bodies[i];
+        m.rotation[i] = {Vec3::Zero(), Vec3::Zero(), 1};
+        m.y.bodies[i].setZero();
+        if (body(i).kind == BodyKind::kinematic)
+            m.y.bodies[i] << m_options.dt * control.angular_velocity, m_options.dt * control.velocity;
+        if (!body(i).is_dynamic()) return;
+        const Mat3 R = quaternion_to_matrix(m_state.bodies[i].orientation);
+        m.rotation[i] =
+            free_rotation(R, m_state.bodies[i].angular_velocity, control.torque, m_parameters.inertia[i], m_options.dt);
+        m.bodies[i] = moving_body(i, m_state.bodies[i], control, m_parameters, m.rotation[i], m_options.dt);
+        m.y.bodies[i] = m.bodies[i].target;
     }
 
     /// Split coupling, first pass: the cloths as if nothing touched them.
@@ -178,13 +206,14 @@ private:
         m.elastic_shift.resize(static_cast<std::size_t>(m_model.node_count()));
         const PassiveBodies nobody;
         for (int c = 0; c < m_model.cloth_count(); ++c) {
-            Zone& zone = new_zone(origin_of(m_model.body_count() + c));
+            ZoneMemory& memory = m_workspace.zones[0];
+            Zone& zone = new_zone(memory, origin_of(m_model.body_count() + c));
             zone.contacts_off = true;
             add_cloth(zone, c, m_state, m_control, m_parameters);
-            const ZoneResult result = solve_zone(zone, nobody, zone_options(), m_workspace.zone, m.zone_visited);
+            const ZoneResult result = solve_zone(zone, nobody, zone_options(), memory.workspace, memory.visited);
             note(result);
             const int first = m_model.cloths[c].first_node;
-            for (int i = 0; i < zone.node_count(); ++i) m.elastic_shift[first + i] = m_workspace.zone.point.y.nodes[i];
+            for (int i = 0; i < zone.node_count(); ++i) m.elastic_shift[first + i] = memory.workspace.point.y.nodes[i];
         }
     }
 
@@ -195,9 +224,9 @@ private:
                                         : m.bodies[object].start.t;
     }
 
-    /// The workspace's zone, empty.
-    Zone& new_zone(const Vec3& origin) {
-        Zone& zone = m_workspace.zone_problem;
+    /// The memory's zone, empty.
+    Zone& new_zone(ZoneMemory& memory, const Vec3& origin) const {
+        Zone& zone = memory.zone;
         clear(zone);
         zone.model = &m_model;
         set_compliance(zone, m_options.compliance);
@@ -242,21 +271,16 @@ private:
         m.visited.resize(count);
         m.outcomes.assign(count, GroupOutcome{});
         m.dirty.assign(count, 1);
-        m.contacts.clear();
-        m.shifts.clear();
-        m.boxes.clear();
-        for (int i : m.dynamic) {
-            const ZoneBody& moving = m.bodies[i];
-            const double radius = body(i).mesh.radius;
-            const double arc = std::max(sagitta(moving.target, radius), sagitta(moving.warm, radius));
-            const double reach = body(i).margin + 0.5 * m_model.thickness + arc;
-            Box box = swept_box({&body(i).mesh, {pose_at(moving, moving.warm), pose_at(moving, moving.target)}, reach});
-            Box start = transformed(body(i).mesh.tree.nodes[0].box, moving.start);
-            start.inflate(reach);
-            box.include(start);
-            m.swept[i] = box;
-            m.boxes.push_back(box);
+        for (GroupResults& results : m.results) {
+            results.contacts.clear();
+            results.shifts.clear();
+            results.blocked.clear();
         }
+        const int dynamic_count = static_cast<int>(m.dynamic.size());
+        m.boxes.resize(m.dynamic.size());
+        m_workspace.workers.for_each_range(dynamic_count, kBodiesARange, [&](int begin, int end, int) {
+            for (int k = begin; k < end; ++k) m.boxes[k] = m.swept[m.dynamic[k]] = body_box(m.dynamic[k]);
+        });
         for (int c = 0; c < m_model.cloth_count(); ++c) {
             Box& box = m.swept[m_model.body_count() + c];
             box = cloth_box(m_model.cloths[c]);
@@ -268,6 +292,19 @@ private:
             return;
         }
         for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes))) m.groups.unite(m.movers[a], m.movers[b]);
+    }
+
+    /// Space for a body from where it is to where it went or would go.
+    Box body_box(int i) const {
+        const ZoneBody& moving = m.bodies[i];
+        const double radius = body(i).mesh.radius;
+        const double arc = std::max(sagitta(moving.target, radius), sagitta(moving.warm, radius));
+        const double reach = body(i).margin + 0.5 * m_model.thickness + arc;
+        Box box = swept_box({&body(i).mesh, {pose_at(moving, moving.warm), pose_at(moving, moving.target)}, reach});
+        Box start = transformed(body(i).mesh.tree.nodes[0].box, moving.start);
+        start.inflate(reach);
+        box.include(start);
+        return box;
     }
 
     /// Space for a cloth's nodes from where they are to where they went or would go.
@@ -293,11 +330,11 @@ private:
         return m_model.ground.present && m.swept[i].lower.z() <= m_model.ground.height + m_model.ground.margin;
     }
 
-    bool meets_passive(int i) {
+    bool meets_passive(int i, std::vector<int>& near) const {
         if (m.passive.bodies.empty()) return false;
-        m.near.clear();
-        query(m.passive.tree, m.swept[i], m.near);
-        return !m.near.empty();
+        near.clear();
+        query(m.passive.tree, m.swept[i], near);
+        return !near.empty();
     }
 
     // --- solving -----------------------------------------------------------------------------------------------
@@ -310,24 +347,46 @@ private:
         std::partial_sum(m.member_end.begin(), m.member_end.end(), m.member_end.begin());
         m.members.resize(m.movers.size());
         for (int i : m.movers) m.members[m.member_end[m.groups.find(i)]++] = i;
-        int first = 0;
+        m.to_solve.clear();
+        int first = 0, size = 0;
         for (int root = 0; root < object_count(); ++root) {
             const int end = m.member_end[root];
-            if (first < end && m.dirty[root]) solve_group(root, first, end);
+            if (first < end && m.dirty[root]) {
+                m.to_solve.push_back({root, first, end});
+                size += end - first;
+                if (m_model.is_cloth(m.members[end - 1])) size += kWorthSharing;
+            }
             m.dirty[root] = 0;
             first = end;
         }
+        // Which thread solves a group leaves no trace: memory of its own, and results in the order of the groups.
+        const int count = static_cast<int>(m.to_solve.size());
+        const int portions = size < kWorthSharing ? 1 : kPortionsPerThread * m_workspace.workers.thread_count();
+        m_workspace.workers.for_each_range(count, std::max(count / portions, 1), [&](int begin, int end, int thread) {
+            for (int k = begin; k < end; ++k) solve_group(m.to_solve[k], thread);
+        });
+        const auto gathered = static_cast<std::ptrdiff_t>(m.blocked.size());
+        for (GroupResults& results : m.results) {
+            m.blocked.insert(m.blocked.end(), results.blocked.begin(), results.blocked.end());
+            results.blocked.clear();
+        }
+        std::sort(m.blocked.begin() + gathered, m.blocked.end(), [](const BlockedDrive& a, const BlockedDrive& b) {
+            return std::pair(a.group, a.body) < std::pair(b.group, b.body);
+        });
     }
 
-    void solve_group(int root, int first, int end) {
+    void solve_group(const Group& group, int thread) {
+        const auto [root, first, end] = group;
+        GroupResults& results = m.results[thread];
         GroupOutcome& outcome = m.outcomes[root];
         outcome = GroupOutcome{};
-        if (end - first == 1 && !m_model.is_cloth(root) && !meets_ground(root) && !meets_passive(root)) {
+        if (end - first == 1 && !m_model.is_cloth(root) && !meets_ground(root) && !meets_passive(root, results.near)) {
             m.y.bodies[root] = m.bodies[root].target;
             m.visited[root] = m.swept[root];
             return;
         }
-        Zone& zone = new_zone(origin_of(root));
+        ZoneMemory& memory = m_workspace.zones[thread];
+        Zone& zone = new_zone(memory, origin_of(root));
         for (int k = first; k < end; ++k) {  // sorted: bodies come before cloths
             if (m_model.is_cloth(m.members[k])) {
                 add_cloth(zone, m.members[k] - m_model.body_count(), m_state, m_control, m_parameters);
@@ -344,13 +403,13 @@ private:
                     zone.nodes[cloth.first_node + k].target = m.elastic_shift[m_model.cloths[cloth.id].first_node + k];
         }
         outcome.solved = true;
-        outcome.result = solve_zone(zone, m.passive, zone_options(), m_workspace.zone, m.zone_visited);
-        const ZonePoint& point = m_workspace.zone.point;
+        outcome.result = solve_zone(zone, m.passive, zone_options(), memory.workspace, memory.visited);
+        const ZonePoint& point = memory.workspace.point;
         if (outcome.result.status == ZoneStatus::bad_start)
             refuse_start(zone.contacts[outcome.result.worst_contact], point.distances[outcome.result.worst_contact]);
         for (int k = first; k < end; ++k) {
             const int i = m.members[k];
-            m.visited[i] = m.zone_visited[k - first];
+            m.visited[i] = memory.visited[k - first];
             m.visited[i].inflate(m_model.margin(i));
             m.visited[i].lower += zone.origin;
             m.visited[i].upper += zone.origin;
@@ -359,20 +418,21 @@ private:
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 m.y.nodes[m_model.cloths[cloth.id].first_node + k] = point.y.nodes[cloth.first_node + k];
-        keep_contacts(zone, point, outcome);
+        outcome.thread = thread;
+        keep_contacts(zone, point, outcome, results);
         if (outcome.result.status == ZoneStatus::converged) return;
         for (int k = zone.dynamic_count; k < zone.body_count(); ++k)
             if (point.y.bodies[k] != zone.bodies[k].target)
-                m.blocked.emplace_back(zone.bodies[k].id, point.y.bodies[k]);
+                results.blocked.push_back({root, zone.bodies[k].id, point.y.bodies[k]});
     }
 
-    void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outcome) {
-        outcome.first_contact = static_cast<int>(m.contacts.size());
+    static void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outcome, GroupResults& results) {
+        outcome.first_contact = static_cast<int>(results.contacts.size());
         for (const ActiveContact& active : point.active) {
             const ZoneContact& contact = zone.contacts[active.index];
             const Contact& c = contact.contact;
-            m.contacts.push_back(c);
-            m.shifts.push_back(contact.shift);
+            results.contacts.push_back(c);
+            results.shifts.push_back(contact.shift);
             outcome.max_compression =
                 std::max(outcome.max_compression, contact.range.rest - contact.shift - active.geometry.distance);
             std::uint64_t& hash = outcome.signature;
@@ -380,7 +440,7 @@ private:
             hash = mix(hash, pack(c.feature_a, static_cast<std::uint32_t>(c.feature_b)));
             hash = mix(hash, pack(static_cast<int>(c.type), active.geometry.closest.feature_code));
         }
-        outcome.contact_end = static_cast<int>(m.contacts.size());
+        outcome.contact_end = static_cast<int>(results.contacts.size());
     }
 
     [[noreturn]] void refuse_start(const ZoneContact& contact, double distance) const {
@@ -420,11 +480,12 @@ private:
     void shorten_drives(bool stop) {
         m_info.converged = false;
         m_info.status = ZoneStatus::blocked;
-        for (const auto& [i, reached] : m.blocked) {
+        for (const BlockedDrive& blocked : m.blocked) {
+            Vec6& y = m.y.bodies[blocked.body];
             if (stop)
-                m.y.bodies[i].setZero();
-            else if (reached.squaredNorm() < m.y.bodies[i].squaredNorm())
-                m.y.bodies[i] = reached;
+                y.setZero();
+            else if (blocked.reached.squaredNorm() < y.squaredNorm())
+                y = blocked.reached;
         }
     }
 
@@ -446,12 +507,15 @@ private:
             }
         }
         const auto for_each_contact = [&](const auto& visit) {
-            for (int root : m.movers)
-                for (int k = m.outcomes[root].first_contact; k < m.outcomes[root].contact_end; ++k) visit(k);
+            for (int root : m.movers) {
+                const GroupOutcome& outcome = m.outcomes[root];
+                const GroupResults& results = m.results[outcome.thread];
+                for (int k = outcome.first_contact; k < outcome.contact_end; ++k)
+                    visit(results.contacts[k], results.shifts[k]);
+            }
         };
         m_info.contacts = 0;
-        for_each_contact([&](int k) {
-            const Contact& c = m.contacts[k];
+        for_each_contact([&](const Contact& c, double) {
             ++m_info.contacts;
             if (yields(c.object_a)) m.zone_of[c.object_a] = 0;
             if (yields(c.object_b)) m.zone_of[c.object_b] = 0;
@@ -476,7 +540,7 @@ private:
         const auto zone_of_contact = [&](const Contact& c) {
             return m.zone_of[yields(c.object_a) ? c.object_a : c.object_b];
         };
-        for_each_contact([&](int k) { ++m.zone_contact_end[zone_of_contact(m.contacts[k])]; });
+        for_each_contact([&](const Contact& c, double) { ++m.zone_contact_end[zone_of_contact(c)]; });
         int bodies = 0, cloths = 0, contacts = 0;
         for (std::size_t z = 0; z < m.zone_body_end.size(); ++z) {
             if (m.zone_contact_end[z] > 0) {
@@ -498,10 +562,10 @@ private:
                 m.zone_bodies[m.zone_body_end[m.zone_of[i]]++] = i;
         }
         m.zone_shifts.resize(m.zone_contacts.size());
-        for_each_contact([&](int k) {
-            const int slot = m.zone_contact_end[zone_of_contact(m.contacts[k])]++;
-            m.zone_contacts[slot] = m.contacts[k];
-            m.zone_shifts[slot] = m.shifts[k];
+        for_each_contact([&](const Contact& c, double shift) {
+            const int slot = m.zone_contact_end[zone_of_contact(c)]++;
+            m.zone_contacts[slot] = c;
+            m.zone_shifts[slot] = shift;
         });
     }
 
@@ -521,29 +585,9 @@ private:
             if (m_info.status == ZoneStatus::converged) m_info.status = ZoneStatus::spinning;
         }
         SceneState result = m_state;
-        for (int i = 0; i < m_model.body_count(); ++i) {
-            BodyState& end = result.bodies[i];
-            const Vec3 turn = m.y.bodies[i].head<3>(), shift = m.y.bodies[i].tail<3>();
-            if (!turn.isZero(0.0)) {
-                end.orientation = quaternion_multiply(exp_quaternion(turn), end.orientation);
-                end.orientation /= end.orientation.norm();
-            }
-            end.position += shift;
-            switch (body(i).kind) {
-                case BodyKind::dynamic:
-                    // w1 = turn / dt and v1 = shift / dt, written so that free bodies keep exactly what free motion gives.
-                    end.angular_velocity = m.rotation[i].angular_velocity + (turn - m.rotation[i].rotation) / dt;
-                    end.velocity = free_velocity(i, m_state.bodies[i], m_control.bodies[i], m_parameters, dt) +
-                                   (shift - m.bodies[i].target.tail<3>()) / dt;
-                    break;
-                case BodyKind::kinematic:
-                    end.angular_velocity = m_info.converged ? m_control.bodies[i].angular_velocity : Vec3(turn / dt);
-                    end.velocity = m_info.converged ? m_control.bodies[i].velocity : Vec3(shift / dt);
-                    break;
-                case BodyKind::static_:
-                    break;
-            }
-        }
+        m_workspace.workers.for_each_range(m_model.body_count(), kBodiesARange, [&](int begin, int end, int) {
+            for (int i = begin; i < end; ++i) finish_body(i, result.bodies[i]);
+        });
         for (const Cloth& cloth : m_model.cloths) {
             for (int k = 0; k < cloth.node_count(); ++k) {
                 const int node = cloth.first_node + k;
@@ -553,6 +597,31 @@ private:
             }
         }
         return result;
+    }
+
+    /// From the start of the step to its end.
+    void finish_body(int i, BodyState& end) const {
+        const double dt = m_options.dt;
+        const Vec3 turn = m.y.bodies[i].head<3>(), shift = m.y.bodies[i].tail<3>();
+        if (!turn.isZero(0.0)) {
+            end.orientation = quaternion_multiply(exp_quaternion(turn), end.orientation);
+            end.orientation /= end.orientation.norm();
+        }
+        end.position += shift;
+        switch (body(i).kind) {
+            case BodyKind::dynamic:
+                // w1 = turn / dt and v1 = shift / dt, written so that free bodies keep exactly what free motion gives.
+                end.angular_velocity = m.rotation[i].angular_velocity + (turn - m.rotation[i].rotation) / dt;
+                end.velocity = free_velocity(i, m_state.bodies[i], m_control.bodies[i], m_parameters, dt) +
+                               (shift - m.bodies[i].target.tail<3>()) / dt;
+                break;
+            case BodyKind::kinematic:
+                end.angular_velocity = m_info.converged ? m_control.bodies[i].angular_velocity : Vec3(turn / dt);
+                end.velocity = m_info.converged ? m_control.bodies[i].velocity : Vec3(shift / dt);
+                break;
+            case BodyKind::static_:
+                break;
+        }
     }
 
     void write(StepRecord& record) const {
@@ -581,7 +650,12 @@ private:
 
 }  // namespace
 
-StepWorkspace::StepWorkspace() : forward(std::make_unique<ForwardScratch>()) {}
+StepWorkspace::StepWorkspace(int thread_count)
+    : workers(thread_count),
+      zones(static_cast<std::size_t>(thread_count)),
+      forward(std::make_unique<ForwardScratch>()) {
+    forward->results.resize(static_cast<std::size_t>(thread_count));
+}
 StepWorkspace::~StepWorkspace() = default;
 
 std::size_t StepRecord::bytes() const {

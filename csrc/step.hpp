@@ -9,6 +9,7 @@
 #include "contact/zone_solver.hpp"
 #include "dynamics/free_motion.hpp"
 #include "model/state.hpp"
+#include "parallel/workers.hpp"
 
 /// One time step and its backward: the only place that knows the whole order.
 namespace diffsim {
@@ -68,17 +69,30 @@ class PenetratingStart : public std::invalid_argument {
     using std::invalid_argument::invalid_argument;
 };
 
-/// Memory that steps reuse. One per thread.
+/// What one thread needs to solve a zone.
+struct ZoneMemory {
+    Zone zone;
+    ZoneWorkspace workspace;
+    std::vector<Box> visited;
+};
+
+/// Memory that steps reuse, and the threads among which a step divides its bodies and zones. No result depends on their
+/// number. Serves one step at a time.
 class StepWorkspace {
 public:
-    StepWorkspace();
+    explicit StepWorkspace(int thread_count = 1);
     ~StepWorkspace();
 
-    ZoneWorkspace zone;
-    Zone zone_problem;
+    Workers workers;
+    std::vector<ZoneMemory> zones;  ///< one per thread
     struct ForwardScratch;
     std::unique_ptr<ForwardScratch> forward;
+    struct BackwardScratch;
+    std::shared_ptr<BackwardScratch> backward;  ///< made by the first backward
 };
+
+/// From how many bodies on loops that do little for each are shared among threads, and in what portions.
+inline constexpr int kBodiesARange = 128;
 
 /// Advance by options.dt. `record`, if given, receives what step_backward needs; it does not change the result.
 /// Throws PenetratingStart if objects penetrate at the start.

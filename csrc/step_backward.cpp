@@ -9,6 +9,40 @@
 namespace diffsim {
 namespace {
 
+constexpr int kWorthSharing = 64;       // bodies and nodes in zones: fewer are done before a thread has woken up
+constexpr int kPortionsPerThread = 32;  // of the zones: they take differently long
+
+/// Where a zone's bodies, cloths and contacts begin or end in the record.
+struct ZoneRange {
+    int body = 0, cloth = 0, contact = 0;
+};
+
+/// What a zone gives a body that it shares with others.
+struct SharedGradient {
+    int zone, body;
+    Vec6 pose;
+};
+
+/// What one thread needs beside a zone's memory.
+struct alignas(64) BackwardLane {  // of cache lines of its own
+    std::vector<int> local;        ///< index in the zone at hand, by object; -1 if it is not in it
+    Coordinates upstream;
+    std::vector<SharedGradient> shared;
+};
+
+}  // namespace
+
+struct StepWorkspace::BackwardScratch {
+    std::vector<ZoneRange> zone_first;  ///< and behind the last zone's the end
+    std::vector<Vec6> pose_gradient;    ///< along the twist of the body at the end of the step
+    std::vector<Vec6> multiplier;
+    std::vector<char> in_zone;
+    std::vector<BackwardLane> lanes;  ///< one per thread
+    std::vector<SharedGradient> shared;
+};
+
+namespace {
+
 /// The backward of one step, body by body and zone by zone.
 class StepBackward {
 public:
@@ -23,6 +57,7 @@ public:
           m_record(record),
           m_needs(needs),
           m_workspace(workspace),
+          m(*workspace.backward),
           m_gradient(gradient),
           m_control_gradient(control_gradient),
           m_parameter_gradient(parameter_gradient) {}
@@ -30,29 +65,15 @@ public:
     void run() {
         if (m_record.held) return;
         const std::size_t count = m_model.bodies.size();
-        m_pose_gradient.assign(count, Vec6::Zero());
-        m_multiplier.assign(count, Vec6::Zero());
-        std::vector<char> in_zone(count, 0);
-        ZoneRange first;
-        for (std::size_t k = 0; k < m_record.zone_body_end.size(); ++k) {
-            const ZoneRange end{m_record.zone_body_end[k], m_record.zone_cloth_end[k], m_record.zone_contact_end[k]};
-            for (int b = first.body; b < end.body; ++b) in_zone[m_record.zone_bodies[b]] = 1;
-            solve_zone_adjoint(first, end);
-            first = end;
-        }
-        for (int i = 0; i < static_cast<int>(count); ++i) {
-            switch (m_model.bodies[i].kind) {
-                case BodyKind::dynamic:
-                    dynamic_body(i, in_zone[i] != 0);
-                    break;
-                case BodyKind::kinematic:
-                    kinematic_body(i);
-                    break;
-                case BodyKind::static_:
-                    static_body(i);
-                    break;
-            }
-        }
+        m.pose_gradient.assign(count, Vec6::Zero());
+        m.multiplier.assign(count, Vec6::Zero());
+        m.in_zone.assign(count, 0);
+        for (int i : m_record.zone_bodies) m.in_zone[i] = 1;
+        solve_zones();
+        m_workspace.workers.for_each_range(static_cast<int>(count), kBodiesARange, [&](int begin, int end, int) {
+            for (int i = begin; i < end; ++i) finish_body(i);
+        });
+        add_gravity();
     }
 
 private:
@@ -68,14 +89,57 @@ private:
 
     Vec3 node_upstream(int i) const { return m_gradient.node_position[i] + m_gradient.node_velocity[i] / m_options.dt; }
 
-    /// Where a zone's bodies, cloths and contacts begin or end in the record.
-    struct ZoneRange {
-        int body = 0, cloth = 0, contact = 0;
-    };
+    void solve_zones() {
+        m.zone_first.assign(1, ZoneRange{});
+        for (std::size_t k = 0; k < m_record.zone_body_end.size(); ++k)
+            m.zone_first.push_back(
+                {m_record.zone_body_end[k], m_record.zone_cloth_end[k], m_record.zone_contact_end[k]});
+        // Threads write to the zones' own bodies and cloths. What zones share is added up after, in the zones' order.
+        const int count = static_cast<int>(m.zone_first.size()) - 1;
+        const bool worth_it = !m_record.zone_cloths.empty() || m_record.zone_bodies.size() >= kWorthSharing;
+        const int portions = worth_it ? kPortionsPerThread * m_workspace.workers.thread_count() : 1;
+        m_workspace.workers.for_each_range(count, std::max(count / portions, 1), [&](int begin, int end, int thread) {
+            for (int k = begin; k < end; ++k) solve_zone_adjoint(k, thread);
+        });
+        m.shared.clear();
+        for (BackwardLane& lane : m.lanes) {
+            m.shared.insert(m.shared.end(), lane.shared.begin(), lane.shared.end());
+            lane.shared.clear();
+        }
+        std::sort(m.shared.begin(), m.shared.end(), [](const SharedGradient& a, const SharedGradient& b) {
+            return std::pair(a.zone, a.body) < std::pair(b.zone, b.body);
+        });
+        for (const SharedGradient& part : m.shared) m.pose_gradient[part.body] += part.pose;
+    }
 
-    /// The workspace's zone, with the bodies and cloths of the record that yield.
-    Zone& rebuild_zone(const ZoneRange& first, const ZoneRange& end) {
-        Zone& zone = m_workspace.zone_problem;
+    void finish_body(int i) {
+        switch (m_model.bodies[i].kind) {
+            case BodyKind::dynamic:
+                dynamic_body(i, m.in_zone[i] != 0);
+                break;
+            case BodyKind::kinematic:
+                kinematic_body(i);
+                break;
+            case BodyKind::static_:
+                static_body(i);
+                break;
+        }
+    }
+
+    /// v̂ = v0 + dt (g + f / m): gravity gets dt times what the velocity at the start gets.
+    void add_gravity() {
+        Vec3 sum = Vec3::Zero();
+        for (std::size_t i = 0; i < m_model.bodies.size(); ++i)
+            if (m_model.bodies[i].is_dynamic()) sum += m_gradient.bodies[i].velocity;
+        for (const Cloth& cloth : m_model.cloths)
+            for (int k = 0; k < cloth.node_count(); ++k)
+                if (!cloth.pinned[k]) sum += m_gradient.node_velocity[cloth.first_node + k];
+        m_parameter_gradient.gravity += m_options.dt * sum;
+    }
+
+    /// The memory's zone, with the bodies and cloths of the record that yield.
+    void rebuild_zone(const ZoneRange& first, const ZoneRange& end, ZoneMemory& memory, BackwardLane& lane) {
+        Zone& zone = memory.zone;
         clear(zone);
         zone.model = &m_model;
         set_compliance(zone, m_options.compliance);
@@ -87,14 +151,13 @@ private:
                           ? m_record.start.bodies[m_record.zone_bodies[first.body]].position
                           : m_record.start.node_position[m_model.cloths[m_record.zone_cloths[first.cloth]].first_node];
         zone.ground_height = m_model.ground.height - zone.origin.z();
-        m_workspace.zone.point.y.resize(0, 0);
-        for (int b = first.body; b < end.body; ++b) join_body(zone, m_record.zone_bodies[b]);
+        memory.workspace.point.y.resize(0, 0);
+        for (int b = first.body; b < end.body; ++b) join_body(memory, lane, m_record.zone_bodies[b]);
         zone.dynamic_count = end.body - first.body;
-        for (int c = first.cloth; c < end.cloth; ++c) join_cloth(zone, m_record.zone_cloths[c]);
-        return zone;
+        for (int c = first.cloth; c < end.cloth; ++c) join_cloth(memory, lane, m_record.zone_cloths[c]);
     }
 
-    void join_body(Zone& zone, int id) {
+    void join_body(ZoneMemory& memory, BackwardLane& lane, int id) const {
         const BodyState& state = m_record.start.bodies[id];
         ZoneBody body;
         body.id = id;
@@ -102,32 +165,35 @@ private:
             body = moving_body(id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
         else
             body.start = {quaternion_to_matrix(state.orientation), state.position};
-        body.start.t -= zone.origin;
-        m_local[id] = static_cast<int>(zone.bodies.size());
-        zone.bodies.push_back(body);
-        m_workspace.zone.point.y.bodies.push_back(m_record.y.bodies[id]);
+        body.start.t -= memory.zone.origin;
+        lane.local[id] = static_cast<int>(memory.zone.bodies.size());
+        memory.zone.bodies.push_back(body);
+        memory.workspace.point.y.bodies.push_back(m_record.y.bodies[id]);
     }
 
-    void join_cloth(Zone& zone, int id) {
+    void join_cloth(ZoneMemory& memory, BackwardLane& lane, int id) const {
         const Cloth& cloth = m_model.cloths[id];
-        m_local[m_model.body_count() + id] = static_cast<int>(zone.cloths.size());
+        Zone& zone = memory.zone;
+        lane.local[m_model.body_count() + id] = static_cast<int>(zone.cloths.size());
         add_cloth(zone, id, m_record.start, m_control, m_parameters);
         const int first = zone.cloths.back().first_node;
         for (int k = 0; k < cloth.node_count(); ++k) {
-            m_workspace.zone.point.y.nodes.push_back(m_record.y.nodes[cloth.first_node + k]);
+            memory.workspace.point.y.nodes.push_back(m_record.y.nodes[cloth.first_node + k]);
             if (m_options.split) zone.nodes[first + k].target = m_record.elastic_shift[cloth.first_node + k];
         }
     }
 
-    void list_contacts(Zone& zone, const ZoneRange& first, const ZoneRange& end) {
+    void list_contacts(const ZoneRange& first, const ZoneRange& end, ZoneMemory& memory, BackwardLane& lane) const {
+        Zone& zone = memory.zone;
         for (int c = first.contact; c < end.contact; ++c) {
             const Contact& contact = m_record.contacts[c];
             for (int object : {contact.object_a, contact.object_b})
-                if (object >= 0 && m_local[object] < 0) join_body(zone, object);  // one that does not yield
+                if (object >= 0 && lane.local[object] < 0) join_body(memory, lane, object);  // one that does not yield
         }
         const auto object_of = [&](int object) {
             if (object == kGround) return ZoneObject{kGround, -1};
-            return m_model.is_cloth(object) ? ZoneObject{kNobody, m_local[object]} : ZoneObject{m_local[object], -1};
+            return m_model.is_cloth(object) ? ZoneObject{kNobody, lane.local[object]}
+                                            : ZoneObject{lane.local[object], -1};
         };
         for (int c = first.contact; c < end.contact; ++c) {
             const Contact& contact = m_record.contacts[c];
@@ -150,11 +216,15 @@ private:
         }
     }
 
-    void solve_zone_adjoint(const ZoneRange& first, const ZoneRange& end) {
-        m_local.resize(m_model.bodies.size() + m_model.cloths.size(), -1);
-        Zone& zone = rebuild_zone(first, end);
-        list_contacts(zone, first, end);
-        ZonePoint& point = m_workspace.zone.point;
+    void solve_zone_adjoint(int index, int thread) {
+        const ZoneRange &first = m.zone_first[index], &end = m.zone_first[index + 1];
+        ZoneMemory& memory = m_workspace.zones[thread];
+        BackwardLane& lane = m.lanes[thread];
+        lane.local.resize(m_model.bodies.size() + m_model.cloths.size(), -1);
+        rebuild_zone(first, end, memory, lane);
+        list_contacts(first, end, memory, lane);
+        Zone& zone = memory.zone;
+        ZonePoint& point = memory.workspace.point;
         evaluate(zone, point);
         bool below_floor = false;
         for (std::size_t k = 0; k < zone.contacts.size(); ++k)
@@ -163,31 +233,34 @@ private:
             rescue_contacts(zone);
             evaluate(zone, point);
         }
-        Coordinates upstreams;
-        for (int b = first.body; b < end.body; ++b) upstreams.bodies.push_back(upstream(m_record.zone_bodies[b]));
+        lane.upstream.resize(0, 0);
+        for (int b = first.body; b < end.body; ++b) lane.upstream.bodies.push_back(upstream(m_record.zone_bodies[b]));
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
-                upstreams.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
+                lane.upstream.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
         const ZoneAdjoint adjoint =
-            zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, m_workspace.zone.system);
+            zone_adjoint(zone, point, lane.upstream, m_options.adjoint, m_needs, memory.workspace.system);
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
-            m_local[id] = -1;
-            m_pose_gradient[id] += adjoint.place_gradient.bodies[k];
-            if (k >= zone.dynamic_count) continue;
-            m_multiplier[id] = adjoint.multiplier.bodies[k];
+            lane.local[id] = -1;
+            if (k >= zone.dynamic_count) {
+                lane.shared.push_back({index, id, adjoint.place_gradient.bodies[k]});
+                continue;
+            }
+            m.pose_gradient[id] = adjoint.place_gradient.bodies[k];
+            m.multiplier[id] = adjoint.multiplier.bodies[k];
             m_parameter_gradient.mass[id] += adjoint.mass_gradient[k];
         }
         if (zone.cloths.empty()) return;
-        for (const ZoneCloth& cloth : zone.cloths) m_local[m_model.body_count() + cloth.id] = -1;
+        for (const ZoneCloth& cloth : zone.cloths) lane.local[m_model.body_count() + cloth.id] = -1;
         if (m_options.split)
-            split_cloths(zone, adjoint);
+            split_cloths(zone, adjoint, memory.workspace.system);
         else
             finish_cloths(zone, adjoint);
     }
 
     /// Split coupling: carry the contact pass's gradient with respect to its targets on through the elastic pass.
-    void split_cloths(const Zone& contact_zone, const ZoneAdjoint& contact) {
+    void split_cloths(const Zone& contact_zone, const ZoneAdjoint& contact, BlockSystem& system) {
         for (const ZoneCloth& cloth : contact_zone.cloths) {
             const Cloth& model = m_model.cloths[cloth.id];
             Zone zone;
@@ -211,8 +284,7 @@ private:
                 m_parameter_gradient.cloths[cloth.id].density += mass_gradient * model.node_area[k];
             }
             evaluate(zone, point);
-            ZoneAdjoint adjoint =
-                zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, m_workspace.zone.system);
+            ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, system);
             for (int k = 0; k < model.node_count(); ++k) {
                 const int node = cloth.first_node + k;
                 adjoint.place_gradient.nodes[k] += contact.place_gradient.nodes[node];
@@ -271,7 +343,6 @@ private:
         const Vec3& force = m_control.node_force[node];
         mass_gradient -= z.dot(error) + dt / (mass * mass) * force.dot(grad_velocity);
         m_parameter_gradient.cloths[cloth].density += mass_gradient * model.node_area[k];
-        m_parameter_gradient.gravity += dt * grad_velocity;
         m_control_gradient.node_force[node] += dt / mass * grad_velocity;
         m_gradient.node_position[node] += place;
         m_gradient.node_velocity[node] = grad_velocity;
@@ -300,7 +371,7 @@ private:
         Vec6 mass_z = upstream(i);
         Vec3 turn_covector = Vec3::Zero();  // of R0, through M and the contacts
         if (in_zone) {
-            const Vec6& z = m_multiplier[i];
+            const Vec6& z = m.multiplier[i];
             const Mat3 inertia = R0 * inertia_body * R0.transpose();
             mass_z << inertia * z.head<3>(), mass * z.tail<3>();
             const Vec3 target_shift = dt * free_velocity(i, start, m_control.bodies[i], m_parameters, dt);
@@ -316,14 +387,13 @@ private:
             R0, start.angular_velocity, m_control.bodies[i].torque, inertia_body, dt, rotation, up.angular_velocity,
             grad_rotation, m_needs.inertia);
         BodyStateGradient& out = m_gradient.bodies[i];
-        const Vec6& pose = m_pose_gradient[i];
+        const Vec6& pose = m.pose_gradient[i];
         const Vec3 end_covector = up.orientation + pose.head<3>();
         out.orientation = exp_rotation(y.head<3>()).transpose() * end_covector + turn_covector + free.orientation;
         out.position = up.position + pose.tail<3>();
         out.velocity = grad_free_velocity;
         out.angular_velocity = free.angular_velocity;
         if (m_needs.inertia) m_parameter_gradient.inertia[i] += free.inertia_body;
-        m_parameter_gradient.gravity += dt * grad_free_velocity;
         m_parameter_gradient.mass[i] -= dt / (mass * mass) * m_control.bodies[i].force.dot(grad_free_velocity);
         m_control_gradient.bodies[i].force += dt / mass * grad_free_velocity;
         m_control_gradient.bodies[i].torque += free.torque;
@@ -333,8 +403,8 @@ private:
         const double dt = m_options.dt;
         BodyStateGradient& g = m_gradient.bodies[i];
         const Vec3 theta = m_record.y.bodies[i].head<3>();
-        const Vec3 covector = g.orientation + m_pose_gradient[i].head<3>();
-        const Vec3 shift = g.position + m_pose_gradient[i].tail<3>();
+        const Vec3 covector = g.orientation + m.pose_gradient[i].head<3>();
+        const Vec3 shift = g.position + m.pose_gradient[i].tail<3>();
         m_control_gradient.bodies[i].angular_velocity +=
             g.angular_velocity + dt * left_jacobian(theta).transpose() * covector;
         m_control_gradient.bodies[i].velocity += g.velocity + dt * shift;
@@ -345,8 +415,8 @@ private:
     }
 
     void static_body(int i) {
-        m_gradient.bodies[i].orientation += m_pose_gradient[i].head<3>();
-        m_gradient.bodies[i].position += m_pose_gradient[i].tail<3>();
+        m_gradient.bodies[i].orientation += m.pose_gradient[i].head<3>();
+        m_gradient.bodies[i].position += m.pose_gradient[i].tail<3>();
     }
 
     const Model& m_model;
@@ -356,12 +426,10 @@ private:
     const StepRecord& m_record;
     const GradientNeeds& m_needs;
     StepWorkspace& m_workspace;
+    StepWorkspace::BackwardScratch& m;
     SceneStateGradient& m_gradient;
     SceneControlGradient& m_control_gradient;
     ParameterGradient& m_parameter_gradient;
-    std::vector<Vec6> m_pose_gradient;  // along the twist of the body at the end of the step
-    std::vector<Vec6> m_multiplier;
-    std::vector<int> m_local;  // index in the zone at hand, by object; -1 if it is not in it
 };
 
 }  // namespace
@@ -370,6 +438,10 @@ void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
+    if (!workspace.backward) {
+        workspace.backward = std::make_shared<StepWorkspace::BackwardScratch>();
+        workspace.backward->lanes.resize(workspace.zones.size());
+    }
     StepBackward(
         model, options, parameters, control, record, needs, workspace, gradient, control_gradient, parameter_gradient)
         .run();

@@ -76,7 +76,9 @@ class Simulator(Measurements):
             the same result for more work; there to measure what locality saves.
         tolerance: Relative KKT residual at which a step has converged.
         max_iterations: Newton iterations a step may take. Default: 200, in scenes with cloth 2000.
-        num_threads: Solve that much at a time; no result depends on it. Default: `torch.get_num_threads()`.
+        num_threads: How many threads a call may use; no result depends on it. They divide the scenes of a batch, or,
+            where there are fewer scenes than threads, the bodies and zones of one big scene: up to some 60 bodies in
+            contact one thread is faster alone. Default: `torch.get_num_threads()`.
         on_failure: What follows a step that did not converge: "warn" (once, `ConvergenceWarning`) or "raise"
             (`SolverError`).
         check: Whether to look for overlaps in the scene, and for parameter values this version does not know. Types and

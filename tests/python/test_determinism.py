@@ -112,6 +112,123 @@ def test_one_thread_or_more(threads: int) -> None:
     assert_same_gradients(runs[0][1], runs[1][1])
 
 
+def many_zones() -> ds.Scene:
+    """Stacks, pushers and obstacles that several stacks lean on, more than enough to be shared among threads."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(ds.shapes.box((14.0, 0.3, 0.2)), kind="static", position=(6, -0.42, 0.15))
+    for row in range(3):
+        scene.add_body(
+            ds.shapes.box((14.0, 0.2, 0.4)), kind="kinematic", position=(6, 0.5 + row, 0.3), velocity=(0, -0.55, 0)
+        )
+    for k in range(36):
+        x, y = k % 12, k // 12
+        turn = (1.0, 0.002 * x, 0.0, 0.1 * y)
+        scene.add_body(ds.shapes.box(0.5), density=800.0, position=(x, y, 0.28), orientation=turn)
+        scene.add_sphere(0.2, density=300.0, position=(x + 0.03, y - 0.02, 0.8 + 0.01 * k), velocity=(0, 0, -1))
+    return scene
+
+
+def blocked_drives() -> ds.Scene:
+    """Presses that squeeze boxes on the ground, where the step has to be solved again with shorter drives."""
+    scene = ds.Scene()
+    scene.add_ground()
+    for k in range(2):
+        scene.add_body(
+            ds.shapes.box((18.0, 0.8, 0.2)), kind="kinematic", position=(8.5, k, 0.6 + 0.02 * k), velocity=(0, 0, -3.0)
+        )
+    for k in range(72):
+        scene.add_body(
+            ds.shapes.box((0.3, 0.3, 0.4 + 0.002 * (k % 5))),
+            density=500.0,
+            position=(0.5 * (k // 2), k % 2, 0.23),
+            orientation=(1, 0.01, 0.01 * (k % 3), 0.1),
+        )
+    return scene
+
+
+def cloths_and_bodies(**options: Any) -> ds.Scene:
+    scene = ds.Scene(**options)
+    scene.add_ground()
+    for k in range(3):
+        scene.add_sphere(0.15, density=400.0, position=(k, 0.02 * k, 0.2))
+        scene.add_cloth(ds.shapes.sheet(0.6, 7), position=(k, 0, 0.37 + 0.01 * k), pinned=[0, 6] if k == 1 else [])
+        scene.add_body(ds.shapes.box(0.2), density=500.0, position=(k + 0.45, 0, 0.13), orientation=(1, 0, 0, 0.1 * k))
+    return scene
+
+
+def shared_run(make: Callable[[], ds.Scene], threads: int, steps: int, **options: Any) -> tuple[ds.State, list[Tensor]]:
+    """One scene, not a batch, and gradients with respect to all that there is."""
+    sim = ds.Simulator(make(), dt=0.01, num_threads=threads, **options)
+    start = sim.initial_state()
+    names = [*STATE_FIELDS, *(("node_position", "node_velocity") if start.node_position.shape[-2] else ())]
+    leaves = {name: getattr(start, name).detach().clone().requires_grad_() for name in names}
+    force = torch.zeros_like(start.position).requires_grad_()
+    parameters = [sim.mass, sim.inertia, sim.gravity]
+    if len(names) > len(STATE_FIELDS):
+        parameters += [sim.cloth_density, sim.cloth_stretch, sim.cloth_shear, sim.cloth_bend]
+    for parameter in parameters:
+        parameter.requires_grad_()
+    trajectory = sim.rollout(start.replace(**leaves), ds.Control(force=force), steps)
+    loss = sum((getattr(trajectory, name).sin().sum() for name in names), start=torch.zeros(()))
+    return trajectory.detach(), list(torch.autograd.grad(loss, [*leaves.values(), force, *parameters]))
+
+
+@pytest.mark.filterwarnings("ignore::diffsim.ConvergenceWarning")
+@pytest.mark.parametrize(
+    ("make", "steps", "options"),
+    [
+        (many_zones, 30, {}),
+        (many_zones, 8, {"compliance": 0.0}),
+        (many_zones, 8, {"adjoint": "qr"}),
+        (blocked_drives, 6, {}),
+        (cloths_and_bodies, 12, {}),
+        (cloths_and_bodies, 12, {"coupling": "split"}),
+    ],
+)
+def test_threads_inside_one_scene(make: Callable[[], ds.Scene], steps: int, options: dict[str, Any]) -> None:
+    alone, single = shared_run(make, 1, steps, **options)
+    for threads in (2, 3):
+        together, found = shared_run(make, threads, steps, **options)
+        for name in ("node_position", "node_velocity", *STATE_FIELDS):
+            assert torch.equal(getattr(alone, name), getattr(together, name)), name
+        assert_same_gradients(found, single)
+
+
+@pytest.mark.filterwarnings("default::diffsim.ConvergenceWarning")
+def test_scenes_for_threads_are_what_they_are_for() -> None:
+    """Several zones at a time, bodies that zones share, and drives that are blocked."""
+    sim = ds.Simulator(many_zones(), dt=0.01)
+    sim.rollout(sim.initial_state(), None, 30)
+    assert sim.info is not None
+    assert sim.info.zones >= 10
+    assert sim.info.contacts >= 100
+    sim = ds.Simulator(blocked_drives(), dt=0.01)
+    with pytest.warns(ds.ConvergenceWarning):
+        sim.rollout(sim.initial_state(), None, 6)
+    assert sim.info is not None
+    assert "blocked" in sim.info.failure
+    sim = ds.Simulator(cloths_and_bodies(), dt=0.01)
+    sim.rollout(sim.initial_state(), None, 12)
+    assert sim.info is not None
+    assert sim.info.zones >= 3
+
+
+def test_threads_refuse_a_state_with_the_same_words() -> None:
+    """Two of many groups penetrate: the first one is named, whichever thread came to it when."""
+    words = set()
+    for threads in (1, 2, 3, 3, 3):
+        sim = ds.Simulator(scenes.falling_cubes(100), dt=0.01, num_threads=threads)
+        state = sim.initial_state()
+        position = state.position.clone()
+        position[[31, 77], 2] = 0.5 - 1e-3
+        with pytest.raises(ValueError, match="penetrate") as caught:
+            sim(state.replace(position=position))
+        words.add(str(caught.value))
+    assert len(words) == 1
+    assert "31" in words.pop()
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies(copied: Callable[[Any], Any]) -> None:
     sim = ds.Simulator(mixed(), dt=0.01)
