@@ -27,6 +27,7 @@ struct SharedGradient {
 struct alignas(64) BackwardLane {  // of cache lines of its own
     std::vector<int> local;        ///< index in the zone at hand, by object; -1 if it is not in it
     Coordinates upstream;
+    AdjointWorkspace adjoint, elastic;  ///< of the zone; of split coupling's elastic pass
     std::vector<SharedGradient> shared;
 };
 
@@ -238,8 +239,7 @@ private:
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 lane.upstream.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
-        const ZoneAdjoint adjoint =
-            zone_adjoint(zone, point, lane.upstream, m_options.adjoint, m_needs, memory.workspace.system);
+        const ZoneAdjoint& adjoint = zone_adjoint(zone, point, lane.upstream, m_options.adjoint, m_needs, lane.adjoint);
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
             lane.local[id] = -1;
@@ -254,13 +254,13 @@ private:
         if (zone.cloths.empty()) return;
         for (const ZoneCloth& cloth : zone.cloths) lane.local[m_model.body_count() + cloth.id] = -1;
         if (m_options.split)
-            split_cloths(zone, adjoint, memory.workspace.system);
+            split_cloths(zone, adjoint, lane.elastic);
         else
             finish_cloths(zone, adjoint);
     }
 
     /// Split coupling: carry the contact pass's gradient with respect to its targets on through the elastic pass.
-    void split_cloths(const Zone& contact_zone, const ZoneAdjoint& contact, BlockSystem& system) {
+    void split_cloths(const Zone& contact_zone, const ZoneAdjoint& contact, AdjointWorkspace& workspace) {
         for (const ZoneCloth& cloth : contact_zone.cloths) {
             const Cloth& model = m_model.cloths[cloth.id];
             Zone zone;
@@ -284,7 +284,7 @@ private:
                 m_parameter_gradient.cloths[cloth.id].density += mass_gradient * model.node_area[k];
             }
             evaluate(zone, point);
-            ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, system);
+            ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, workspace);
             for (int k = 0; k < model.node_count(); ++k) {
                 const int node = cloth.first_node + k;
                 adjoint.place_gradient.nodes[k] += contact.place_gradient.nodes[node];

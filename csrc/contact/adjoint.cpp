@@ -297,9 +297,10 @@ Coordinates solve_qr(
 /// Hard contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
 /// gives way. Every step leaves about a compliance's part; they end when z no longer changes, since a small J z alone
 /// does not mean that z is right. Returns the reactions, the last step's left out: the soft contacts carry it.
-template <typename Solve>
+template <typename SolveInPlace>
 std::vector<double> harden(
-    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const Solve& solve, Coordinates& z) {
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const SolveInPlace& solve_in_place,
+    Coordinates& z) {
     constexpr int kMaxSteps = 30;
     constexpr double kTolerance = 1e-14;  // on the change of z, relative: rounding
     const ContactTermMaker make_term(zone, point);
@@ -329,7 +330,8 @@ std::vector<double> harden(
                     if (!zone.nodes[node].pinned) rhs.nodes[node] -= next[k] * term.row.segment<3>(offset);
                 });
         }
-        const Coordinates better = solve(rhs);
+        solve_in_place(rhs);
+        const Coordinates& better = rhs;
         double change = 0.0, size = 0.0;
         const auto compare = [&](const auto& now, const auto& before) {
             for (std::size_t i = 0; i < now.size(); ++i) {
@@ -346,6 +348,15 @@ std::vector<double> harden(
     return reactions;
 }
 
+/// Overwrite the upstream gradient by z. Returns the reactions of contacts, if they are hard.
+template <typename SolveInPlace>
+std::vector<double> solve(
+    const Zone& zone, const ZonePoint& point, Coordinates& z, const SolveInPlace& solve_in_place) {
+    const Coordinates upstream = zone.hard ? z : Coordinates();
+    solve_in_place(z);
+    return zone.hard ? harden(zone, point, upstream, solve_in_place, z) : std::vector<double>();
+}
+
 /// What contacts add to the gradients: `twist` times their second derivatives, and their reactions if they are hard.
 void add_contacts(
     const Zone& zone, const ZonePoint& point, bool with_curvature, const GradientNeeds& needs,
@@ -360,7 +371,7 @@ void add_contacts(
             [&](int body, int offset) { motion.segment<6>(offset) = twist[body]; },
             [&](int node, int offset) { motion.segment<3>(offset) = result.multiplier.nodes[node]; });
         if (needs.place) {
-            SmallVector gradient = term.hessian * motion;
+            SmallVector gradient = term.hessian.lazyProduct(motion);  // of this size a library call is slower
             if (zone.hard) gradient += reactions[k] * term.row;
             term.for_each(
                 [&](int body, int offset) { result.place_gradient.bodies[body] -= gradient.segment<6>(offset); },
@@ -401,15 +412,18 @@ void add_elasticity(const Zone& zone, const ZonePoint& point, const GradientNeed
 
 }  // namespace
 
-ZoneAdjoint zone_adjoint(
+const ZoneAdjoint& zone_adjoint(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
-    BlockSystem& system) {
+    AdjointWorkspace& workspace) {
     const bool exact = mode == AdjointMode::exact;
-    ZoneAdjoint result;
-    ZoneDerivatives derivatives;
-    Coordinates free_upstream = upstream;
+    BlockSystem& system = workspace.system;
+    ZoneDerivatives& derivatives = workspace.derivatives;
+    ZoneAdjoint& result = workspace.result;
+    std::vector<Vec6>& twist = workspace.twist;
+    result.multiplier = upstream;
     for (int i = 0; i < zone.node_count(); ++i)
-        if (zone.nodes[i].pinned) free_upstream.nodes[i].setZero();
+        if (zone.nodes[i].pinned) result.multiplier.nodes[i].setZero();
+    std::vector<double> reactions;
     if (exact) {
         system.set_pattern(base_pattern(zone));
         differentiate(zone, point, Curvature::exact, derivatives, &system);
@@ -418,34 +432,29 @@ ZoneAdjoint zone_adjoint(
             differentiate(zone, point, Curvature::projected, derivatives, &system);
             system.factorize();
         }
-    }
-    const FreeCoordinates free(zone);
-    const Rows rows = exact ? Rows{} : collect_rows(zone, point, free);
-    MatrixX cloth;
-    std::unique_ptr<InertiaFactor> factor;
-    if (!exact) {
-        cloth = cloth_matrix(zone, point, free, ElasticHessian::exact);
+        reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) { system.solve_in_place(z); });
+    } else {
+        const FreeCoordinates free(zone);
+        const Rows rows = collect_rows(zone, point, free);
+        MatrixX cloth = cloth_matrix(zone, point, free, ElasticHessian::exact);
         if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success)
             cloth = cloth_matrix(zone, point, free, ElasticHessian::projected);
-        if (mode == AdjointMode::qr) factor = std::make_unique<InertiaFactor>(zone, cloth);
+        if (mode == AdjointMode::dense) {
+            reactions = solve(
+                zone, point, result.multiplier, [&](Coordinates& z) { z = solve_dense(zone, free, cloth, rows, z); });
+        } else {
+            const InertiaFactor factor(zone, cloth);
+            reactions =
+                solve(zone, point, result.multiplier, [&](Coordinates& z) { z = solve_qr(free, factor, rows, z); });
+        }
     }
-    const auto solve = [&](const Coordinates& rhs) {
-        if (mode == AdjointMode::dense) return solve_dense(zone, free, cloth, rows, rhs);
-        if (mode == AdjointMode::qr) return solve_qr(free, *factor, rows, rhs);
-        Coordinates z = rhs;
-        system.solve_in_place(z);
-        return z;
-    };
-    result.multiplier = solve(free_upstream);
-    const std::vector<double> reactions =
-        zone.hard ? harden(zone, point, free_upstream, solve, result.multiplier) : std::vector<double>();
 
     result.place_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
     result.start_gradient.assign(zone.nodes.size(), Vec3::Zero());
     result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
     result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
     result.cloth_gradient.assign(zone.cloths.size(), ClothParameters{});
-    std::vector<Vec6> twist(zone.bodies.size(), Vec6::Zero());
+    twist.assign(zone.bodies.size(), Vec6::Zero());
     for (int i = 0; i < zone.dynamic_count; ++i) {
         twist[i] = result.multiplier.bodies[i];
         twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();

@@ -32,10 +32,18 @@ struct ZoneAdjoint {
     std::vector<ClothParameters> cloth_gradient;  ///< through elasticity, one per cloth of the zone
 };
 
+/// Memory that adjoints reuse, their results included.
+struct AdjointWorkspace {
+    BlockSystem system;
+    ZoneDerivatives derivatives;
+    std::vector<Vec6> twist;  ///< z of each body, its turn along the twist at the end of the step
+    ZoneAdjoint result;
+};
+
 /// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution. `upstream` has one
-/// entry per dynamic body and node; those of pinned nodes are not used.
-ZoneAdjoint zone_adjoint(
+/// entry per dynamic body and node; those of pinned nodes are not used. The result is the workspace's, until its next use.
+const ZoneAdjoint& zone_adjoint(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
-    BlockSystem& system);
+    AdjointWorkspace& workspace);
 
 }  // namespace diffsim

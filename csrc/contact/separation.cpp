@@ -75,6 +75,7 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
     Separation result;
     ZonePoint point;
     BlockSystem system, cloth;
+    ContactCoverage coverage;
     Coordinates zero;
     zero.assign_zero(count, node_count);
     for (ZoneBody& body : zone.bodies) body.target.setZero();
@@ -83,7 +84,7 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
     for (int round = 0; round < kMaxRounds; ++round) {
         zone.bodies.resize(count);
         Coordinates begin = zero, end = zero;
-        collect_contacts(zone, passive, begin, end);
+        collect_contacts(zone, passive, begin, end, coverage);
         Placement at;
         at.y = begin;
         place(zone, at.y, at.poses, at.nodes);

@@ -70,7 +70,6 @@ double feature_mass(const Zone& zone, const ZoneContact& contact, bool of_a) {
 void join_passive(
     Zone& zone, const PassiveBodies& passive, const std::vector<Box>& dynamic_boxes, Coordinates& begin,
     Coordinates& end) {
-    if (passive.bodies.empty()) return;
     std::vector<int> near;
     for (Box box : dynamic_boxes) {
         box.lower += zone.origin;
@@ -125,26 +124,41 @@ namespace {
 /// Collects the contacts of a zone; its steps as members.
 class ContactLister {
 public:
-    ContactLister(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end)
-        : m_zone(zone), m_passive(passive), m_begin(begin), m_end(end) {}
+    ContactLister(
+        Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end, ContactCoverage& coverage)
+        : m_zone(zone),
+          m_passive(passive),
+          m_begin(begin),
+          m_end(end),
+          m_coverage(coverage),
+          m_meshes(coverage.scratch.meshes),
+          m_boxes(coverage.scratch.boxes),
+          m_vertices(coverage.scratch.vertices),
+          m_features(coverage.scratch.features) {}
 
-    ContactCoverage run() {
+    void run() {
         m_zone.contacts.clear();
         m_zone.pairs.clear();
+        m_coverage.slack.clear();
+        m_coverage.cloth_slack.clear();
+        m_meshes.clear();
+        m_boxes.clear();
         for (int i = 0; i < m_zone.dynamic_count; ++i) add_body(i);
         if (m_zone.contacts_off) {
             m_coverage.cloth_slack.assign(m_zone.cloths.size(), kInfinity);
             m_coverage.begin = m_begin;
             m_coverage.end = m_end;
-            return std::move(m_coverage);
+            return;
         }
         const std::size_t cloth_count = m_zone.cloths.size();
         m_cloths.reserve(cloth_count);  // meshes point into it
         std::vector<SweptMesh> cloth_meshes;
         for (int c = 0; c < static_cast<int>(cloth_count); ++c) cloth_meshes.push_back(add_cloth(c));
-        std::vector<Box> yielding = m_boxes;
-        for (const SweptMesh& mesh : cloth_meshes) yielding.push_back(swept_box(mesh));
-        join_passive(m_zone, m_passive, yielding, m_begin, m_end);
+        if (!m_passive.bodies.empty()) {
+            std::vector<Box> yielding = m_boxes;
+            for (const SweptMesh& mesh : cloth_meshes) yielding.push_back(swept_box(mesh));
+            join_passive(m_zone, m_passive, yielding, m_begin, m_end);
+        }
         for (int i = m_zone.dynamic_count; i < m_zone.body_count(); ++i) add_body(i);
         for (const SweptMesh& mesh : cloth_meshes) {
             m_meshes.push_back(mesh);
@@ -155,7 +169,6 @@ public:
         for (int c = 0; c < static_cast<int>(cloth_count); ++c) list_self(c);
         m_coverage.begin = m_begin;
         m_coverage.end = m_end;
-        return std::move(m_coverage);
     }
 
 private:
@@ -193,12 +206,11 @@ private:
     }
 
     void list_ground() {
-        std::vector<int> vertices;
         for (int i = 0; i < static_cast<int>(m_meshes.size()); ++i) {
             if (!yields(i)) continue;
-            vertices.clear();
-            collect_vertices_below(m_meshes[i], m_zone.ground_height + m_zone.model->ground.margin, vertices);
-            for (int v : vertices)
+            m_vertices.clear();
+            collect_vertices_below(m_meshes[i], m_zone.ground_height + m_zone.model->ground.margin, m_vertices);
+            for (int v : m_vertices)
                 add_contact(m_zone, {id(i), kGround, ContactType::vertex_patch, v, -1}, object(i), {kGround, -1});
         }
     }
@@ -235,11 +247,12 @@ private:
     Zone& m_zone;
     const PassiveBodies& m_passive;
     Coordinates &m_begin, &m_end;
-    ContactCoverage m_coverage;
-    std::vector<SweptMesh> m_meshes;
-    std::vector<Box> m_boxes;
+    ContactCoverage& m_coverage;
+    std::vector<SweptMesh>& m_meshes;
+    std::vector<Box>& m_boxes;
+    std::vector<int>& m_vertices;
+    std::vector<FeaturePair>& m_features;
     std::vector<SweptCloth> m_cloths;
-    std::vector<FeaturePair> m_features;
 };
 
 /// Whether a cloth's nodes are near the points that they pass at one and the same time of the segment.
@@ -262,8 +275,9 @@ bool is_cloth_covered(const Zone& zone, const ContactCoverage& coverage, int ind
 
 }  // namespace
 
-ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end) {
-    return ContactLister(zone, passive, begin, end).run();
+void collect_contacts(
+    Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end, ContactCoverage& coverage) {
+    ContactLister(zone, passive, begin, end, coverage).run();
 }
 
 bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordinates& y) {
@@ -290,6 +304,7 @@ namespace {
 class MotionBounds {
 public:
     MotionBounds(const Zone& zone, const ZonePoint& point, const Coordinates& y_end) : m_zone(zone) {
+        m_bodies.reserve(zone.bodies.size());
         for (int i = 0; i < zone.body_count(); ++i)
             m_bodies.push_back(motion_bound(y_end.bodies[i] - point.y.bodies[i], zone.mesh(i).radius));
         for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {

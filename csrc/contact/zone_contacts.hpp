@@ -10,6 +10,14 @@ struct ContactCoverage {
     Coordinates begin, end;
     std::vector<double> slack;        ///< one per dynamic body [m]
     std::vector<double> cloth_slack;  ///< one per cloth, for each of its nodes [m]
+
+    /// Memory that listing reuses.
+    struct Scratch {
+        std::vector<SweptMesh> meshes;
+        std::vector<Box> boxes;
+        std::vector<int> vertices;
+        std::vector<FeaturePair> features;
+    } scratch;
 };
 
 /// An object of a zone: a body, a cloth, or {kGround}.
@@ -27,8 +35,9 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
 
 /// List the zone's contacts, of cloths with themselves too, for motions along the segment from `begin` to `end` and
 /// somewhat around it. Bodies of
-/// `passive` that come near join the zone. `begin` and `end` are extended where bodies join.
-ContactCoverage collect_contacts(Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end);
+/// `passive` that come near join the zone. `begin` and `end` are extended where bodies join. `coverage` is overwritten.
+void collect_contacts(
+    Zone& zone, const PassiveBodies& passive, Coordinates& begin, Coordinates& end, ContactCoverage& coverage);
 
 /// Whether the list is complete at these coordinates.
 bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordinates& y);

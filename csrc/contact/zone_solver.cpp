@@ -27,7 +27,12 @@ public:
     ZoneSolver(
         Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
         std::vector<Box>& visited)
-        : m_zone(zone), m_passive(passive), m_options(options), m_w(workspace), m_visited(visited) {}
+        : m_zone(zone),
+          m_passive(passive),
+          m_options(options),
+          m_w(workspace),
+          m_visited(visited),
+          m_coverage(workspace.coverage) {}
 
     ZoneResult solve() {
         start();
@@ -74,7 +79,7 @@ private:
 
     /// List contacts for the way from the current point to y_end.
     void list_contacts(Coordinates& y_end) {
-        m_coverage = collect_contacts(m_zone, m_passive, y(), y_end);
+        collect_contacts(m_zone, m_passive, y(), y_end, m_coverage);
         if (m_rescue) rescue_contacts(m_zone);
         m_position = m_zone.model->thickness;
         if (m_zone.model->ground.present) m_position = std::max(m_position, std::abs(m_zone.ground_height));
@@ -440,7 +445,7 @@ private:
     const ZoneOptions& m_options;
     ZoneWorkspace& m_w;
     std::vector<Box>& m_visited;
-    ContactCoverage m_coverage;
+    ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
     double m_position = 0.0;  // size of the numbers that distances are differences of [m]
     int m_exact_in = 0;       // Newton steps until the exact Hessian is tried again

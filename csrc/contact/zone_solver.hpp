@@ -31,6 +31,7 @@ struct ZoneWorkspace {
     ZonePoint point, trial;
     ZoneDerivatives derivatives, trial_derivatives;
     BlockSystem system;
+    ContactCoverage coverage;
     Coordinates step, y_end;
     Box swept;
 };

@@ -167,8 +167,8 @@ Coordinates without_pinned(const Zone& zone, Coordinates y) {
 }
 
 VectorX multiplier(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode) {
-    BlockSystem system;
-    return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, system).multiplier);
+    AdjointWorkspace workspace;
+    return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).multiplier);
 }
 
 void check_same_system(const Zone& zone, const ZonePoint& point) {
@@ -249,8 +249,9 @@ TEST(all_modes_agree_on_hard_contacts_with_cloth_as_far_as_they_are_straight) {
     CHECK(by_lu.norm() > 0.0);
     CHECK_NEAR(by_qr, by_lu, 1e-8 * by_lu.norm());
     // J z = 0: no contact opens or closes along z.
-    BlockSystem system;
-    const Coordinates z = zone_adjoint(zone, point, upstream, AdjointMode::dense, GradientNeeds{}, system).multiplier;
+    AdjointWorkspace workspace;
+    const Coordinates z =
+        zone_adjoint(zone, point, upstream, AdjointMode::dense, GradientNeeds{}, workspace).multiplier;
     const auto distances_at = [&](double s) {
         ZonePoint moved;
         moved.y = point.y;
@@ -274,8 +275,8 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
         const Zone zone = scene.solve(point);
         CHECK(point.active.size() >= 4);
         const Coordinates upstream = random_upstream(zone, 9);
-        BlockSystem system;
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
+        AdjointWorkspace workspace;
+        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
         // What the loss sees of pinned nodes is their own motion, which is not the adjoint's part.
         const VectorX weights = flatten(without_pinned(zone, upstream));
         const auto loss = [&](const Scene& changed) { return weights.dot(changed.solution()); };
@@ -343,8 +344,8 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
         const Zone zone = scene.solve(point);
         const std::size_t count = scene.bodies.size();
         const Coordinates upstream = random_upstream(zone, 5);
-        BlockSystem system;
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
+        AdjointWorkspace workspace;
+        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
         const auto loss = [&](const Scene& changed) { return flatten(upstream).dot(changed.solution()); };
 
         // d(loss)/d(target) = M z
@@ -397,10 +398,10 @@ TEST(what_is_not_asked_for_is_left_at_zero) {
         ZonePoint point;
         const Zone zone = scene.solve(point);
         const Coordinates upstream = random_upstream(zone, 6);
-        BlockSystem system;
+        AdjointWorkspace workspace;
         const GradientNeeds nothing{false, false, false, false};
-        const ZoneAdjoint all = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
-        const ZoneAdjoint none = zone_adjoint(zone, point, upstream, AdjointMode::exact, nothing, system);
+        const ZoneAdjoint all = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
+        const ZoneAdjoint none = zone_adjoint(zone, point, upstream, AdjointMode::exact, nothing, workspace);
         CHECK(flatten(none.multiplier) == flatten(all.multiplier));
         for (std::size_t i = 0; i < all.place_gradient.nodes.size(); ++i)
             CHECK(none.place_gradient.nodes[i].isZero(0.0));
@@ -416,8 +417,8 @@ TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
     const Zone zone = scene.solve(point);
     CHECK(zone.body_count() == 2);
     const Coordinates upstream = random_upstream(zone, 6);
-    BlockSystem system;
-    const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, system);
+    AdjointWorkspace workspace;
+    const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
     const auto moved = [&](const VectorX& x) {
         Scene changed = scene;
         Pose& start = changed.passive.bodies[0].start;

@@ -80,7 +80,8 @@ Case random_case(const Room& room, check::Random& random) {
     const PassiveBodies passive =
         fixtures::passive_bodies(room.model, {{1, {random_rotation(random), Vec3(0.3, 0.95, 0.2)}, Vec6::Zero()}});
     Coordinates begin = c.y, end = c.y;
-    collect_contacts(zone, passive, begin, end);
+    ContactCoverage coverage;
+    collect_contacts(zone, passive, begin, end, coverage);
     c.y = end;
     for (ZoneContact& contact : zone.contacts) contact.stiffness = {10.0, 0.0, 0.0};
     return c;

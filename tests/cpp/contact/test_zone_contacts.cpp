@@ -93,7 +93,7 @@ Case random_case(const Room& room, check::Random& random, double motion) {
             c.end.nodes.push_back(common + random_vec3(random, 0.5 * motion));
         }
     }
-    c.coverage = collect_contacts(zone, c.passive, c.begin, c.end);
+    collect_contacts(zone, c.passive, c.begin, c.end, c.coverage);
     return c;
 }
 
@@ -283,7 +283,7 @@ TEST(an_allowed_step_keeps_cloth_above_its_floor) {
         c.zone.bodies.resize(2);
         c.begin.bodies.resize(2);
         c.end.bodies.resize(2);
-        collect_contacts(c.zone, c.passive, c.begin, c.end);
+        collect_contacts(c.zone, c.passive, c.begin, c.end, c.coverage);
         ZonePoint point;
         point.y = c.begin;
         evaluate(c.zone, point);
