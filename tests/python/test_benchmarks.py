@@ -16,12 +16,15 @@ SCRIPTS = sorted(BENCHMARKS.glob("[a-z]*.py"))
 # Some of a script's columns, first and last among them.
 COLUMNS = {
     "adjoint_modes": ("scene", "qr_state", "exact_error_median", "dense_backward_ms"),
+    "batch": ("case", "scenes", "loop_forward_per_s", "gradient_ratio"),
     "falling_cubes": ("cubes", "forward_s", "mujoco_elliptic_s", "memory_mb", "rest_gap_m"),
     "fast_differentiation": ("cubes", "mode", "backward_ms", "memory_mb", "error", "backward_to_mujoco"),
     "local_collisions": ("cubes", "step", "mode", "local_ms", "global_ms", "lcp_published_ms", "paper_code_ms"),
     "many_objects": ("objects", "forward_backward_s", "mujoco_forward_s", "memory_mb", "mpm_s", "paper_code_s"),
+    "memory": ("case", "cubes", "peak_mb", "tape_bytes_per_body_step"),
     "overhead": ("run", "nothing_forward_us", "backward_ratio"),
     "relative_scale": ("scale", "forward_backward_s", "memory_mb", "most_iterations"),
+    "threads": ("cubes", "threads", "forward_s", "backward_speedup"),
 }
 POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times
 TEXT = ("mode", "step", "scene", "material", "name", "case", "directions", "peer", "what")

@@ -1,0 +1,83 @@
+"""Peak memory of long and of large rollouts with gradients, each in a process of its own.
+
+`long`: 100 cubes, 10,000 steps, `checkpoint_every` 100; should stay under 1 GiB. `large`: 10,000 cubes, 2 s in 200
+steps, everything recorded; should stay under 4 GiB. The loss is a function of the final state, the gradient is with
+respect to the initial state and the masses. Prints one CSV line per case: the peak of resident memory of the whole
+process, Python and torch included, what was resident before the rollout, seconds, and the tape's bytes per step and
+body.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from _common import print_header, print_row
+
+COLUMNS = ("case", "cubes", "steps", "checkpoint_every", "peak_mb", "before_mb", "seconds", "tape_bytes_per_body_step")
+CASES = {"long": (100, 10_000, 100), "large": (10_000, 200, None)}
+QUICK = {"long": (100, 1000, 50), "large": (1000, 200, None)}
+DT = 0.01
+
+
+def peak_megabytes() -> float:
+    """Of this process so far; the unit is kB on Linux, bytes on macOS."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0 if sys.platform != "darwin" else 1024.0**2)
+
+
+def run(count: int, steps: int, every: int | None, threads: int) -> dict[str, float]:
+    import torch
+
+    import diffsim as ds
+    from diffsim import _core, scenes
+    from diffsim.ops import RolloutCall, rollout
+
+    torch.set_num_threads(1)
+    sim = ds.Simulator(scenes.falling_cubes(count), dt=DT, num_threads=threads, on_failure="raise")
+    sim.mass.requires_grad_()
+    start = sim.initial_state()
+    fields = ("position", "orientation", "velocity", "angular_velocity")
+    inputs = {name: getattr(start, name).requires_grad_() for name in fields}
+    before = peak_megabytes()
+    clock = time.perf_counter()
+    final = sim.rollout(start.replace(**inputs), None, steps, checkpoint_every=every)[-1]
+    loss = final.position.square().sum() + final.velocity.square().sum()
+    gradients = torch.autograd.grad(loss, [*inputs.values(), sim.mass])
+    seconds = time.perf_counter() - clock
+    assert all(bool(g.isfinite().all()) for g in gradients)
+    peak = peak_megabytes()
+
+    call = RolloutCall(sim._model, sim._options, 100, 1, keep_time=True)  # not public, so asked of the operator
+    rollout(call, *inputs.values(), *(None,) * 8, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
+    assert isinstance(call.tape, _core.Tape)
+    return {"peak": peak, "before": before, "seconds": seconds, "tape": call.tape.nbytes / (100 * count)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="a few seconds: a tenth of the steps, of the cubes")
+    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)  # a case's numbers, in the process that runs it
+    options = parser.parse_args()
+    if options.one:
+        count, steps, every = (int(value) for value in options.one)
+        print(json.dumps(run(count, steps, every or None, options.threads)))
+        return 0
+    print_header(clock=time.perf_counter)
+    print_row(COLUMNS)
+    for name, (count, steps, every) in (QUICK if options.quick else CASES).items():
+        command = [sys.executable, str(Path(__file__)), "--threads", str(options.threads)]
+        command += ["--one", str(count), str(steps), str(every or 0)]
+        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        values = [found[key] for key in ("peak", "before", "seconds", "tape")]
+        print_row([name, count, steps, every or "", *values])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
