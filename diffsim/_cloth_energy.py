@@ -9,17 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from . import _core
 from ._mass_properties import FloatArray
 from ._packed import PackedScene
 
 # Sine of the warp's angle with a triangle's normal below which another axis takes its place, as in the core.
 _LEAST_WARP_SINE = 0.1
-
-# What a grid of squares loses of its bending stiffness by folding along their diagonals (csrc/model/cloth.hpp).
-_HINGE_RELAXATION = 1.2
 
 
 @dataclass(frozen=True)
@@ -35,13 +32,15 @@ class ClothElements:
     triangle_cloth: Tensor  #: shape (t,)
     hinges: Tensor  #: nodes: ends of the shared edge, then the corners across from it, shape (h, 4)
     rest_angle: Tensor  #: shape (h,) [rad]
-    weight: Tensor  #: 1.2 |edge|² / (sum of both areas), at rest, shape (h,)
+    weight: Tensor  #: of each by itself (csrc/model/hinge_weights.hpp), shape (h,)
+    couplings: Tensor  #: pairs of hinges, shape (k, 2)
+    coupling_weight: Tensor  #: shape (k,)
     hinge_cloth: Tensor  #: shape (h,)
     poisson: Tensor  #: of each cloth, shape (c,)
 
 
-def cloth_elements(packed: PackedScene) -> ClothElements:
-    """Everything that follows from the rest shapes."""
+def cloth_elements(packed: PackedScene, model: _core.Model) -> ClothElements:
+    """Everything that follows from the rest shapes; the hinges are the model's own."""
     cloths = np.arange(len(packed.cloth_names))
     first_node = np.cumsum(packed.node_count) - packed.node_count
     triangle_cloth = np.repeat(cloths, packed.triangle_count)
@@ -53,23 +52,24 @@ def cloth_elements(packed: PackedScene) -> ClothElements:
     normal /= double_area[:, None]
     warp, weft = _material_axes(normal, packed.warp[triangle_cloth])
     shape = np.stack([np.einsum("ti,tki->tk", warp, edges), np.einsum("ti,tki->tk", weft, edges)], axis=1)
-    hinges, around = _hinges(triangles)
-    rest = torch.from_numpy(packed.node_rest)
-    edge = packed.node_rest[hinges[:, 1]] - packed.node_rest[hinges[:, 0]]
+    hinges, rest_angle, weight, couplings, coupling_weight = model.hinges()
     area = 0.5 * double_area
     node_area = np.bincount(triangles.ravel(), weights=np.repeat(area / 3.0, 3), minlength=len(packed.node_rest))
+    node_cloth = np.repeat(cloths, packed.node_count)
     return ClothElements(
         node_area=torch.from_numpy(node_area),
-        node_cloth=torch.from_numpy(np.repeat(cloths, packed.node_count)),
+        node_cloth=torch.from_numpy(node_cloth),
         free=torch.from_numpy(1.0 - packed.pinned),
         triangles=torch.from_numpy(triangles),
         rest_inverse=torch.from_numpy(np.linalg.inv(shape)),
         area=torch.from_numpy(area),
         triangle_cloth=torch.from_numpy(triangle_cloth),
         hinges=torch.from_numpy(hinges),
-        rest_angle=dihedral_angle(rest, torch.from_numpy(hinges)),
-        weight=torch.from_numpy(_HINGE_RELAXATION * np.square(edge).sum(axis=1) / area[around].sum(axis=1)),
-        hinge_cloth=torch.from_numpy(triangle_cloth[around[:, 0]]),
+        rest_angle=torch.from_numpy(rest_angle),
+        weight=torch.from_numpy(weight),
+        couplings=torch.from_numpy(couplings),
+        coupling_weight=torch.from_numpy(coupling_weight),
+        hinge_cloth=torch.from_numpy(node_cloth[hinges[:, 0]]),
         poisson=torch.from_numpy(packed.cloth_poisson),
     )
 
@@ -82,17 +82,6 @@ def _material_axes(normal: FloatArray, warp: FloatArray) -> tuple[FloatArray, Fl
     along = warp - normal * np.einsum("ti,ti->t", normal, warp)[:, None]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return along, np.cross(normal, along)
-
-
-def _hinges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes of each pair of triangles that share an edge, shape (h, 4), and the two triangles, shape (h, 2)."""
-    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    across = np.roll(triangles, 1, axis=1).ravel()
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    shared = (edges[order[:-1]] == edges[order[1:]]).all(axis=1)
-    first, second = order[:-1][shared], order[1:][shared]
-    nodes = np.concatenate([edges[first], across[first, None], across[second, None]], axis=1)
-    return nodes, np.stack([first // 3, second // 3], axis=1)
 
 
 def dihedral_angle(x: Tensor, hinges: Tensor) -> Tensor:
@@ -123,10 +112,15 @@ def membrane_energy(strain: Tensor, elements: ClothElements, stretch: Tensor, sh
 
 
 def bending_energy(angle: Tensor, elements: ClothElements, bend: Tensor) -> Tensor:
-    """Σ ½ bend weight (θ - θ0)², differences the shorter way round, (..., h) -> (...) [J]."""
+    """Σ ½ bend W_ij (θ_i - θ0_i) (θ_j - θ0_j), differences the shorter way round, (..., h) -> (...) [J]."""
     turn = angle - elements.rest_angle
     turn = turn - 2.0 * torch.pi * torch.ceil(turn.detach() / (2.0 * torch.pi) - 0.5)  # into (-π, π]
-    return (0.5 * bend.index_select(-1, elements.hinge_cloth) * elements.weight * turn * turn).sum(-1)
+    first, second = elements.couplings.unbind(-1)
+    bend = bend.index_select(-1, elements.hinge_cloth)
+    alone = 0.5 * bend * elements.weight * turn * turn
+    coupled = bend.index_select(-1, first) * elements.coupling_weight
+    coupled = coupled * turn.index_select(-1, first) * turn.index_select(-1, second)
+    return alone.sum(-1) + coupled.sum(-1)
 
 
 def elastic_energy(x: Tensor, elements: ClothElements, stretch: Tensor, shear: Tensor, bend: Tensor) -> Tensor:

@@ -21,9 +21,9 @@ class ClothMaterial:
 
         ½ stretch/(1 - poisson²) (ε11² + ε22² + 2 poisson ε11 ε22) + ½ shear (2 ε12)²
 
-    and out of it, with κ the curvature, ½ bend κ² (as a strip on a grid of squares does, which folds a little along
-    their diagonals; held to a cylinder, it stores 1.2 times that). A strip of length L hanging under its own weight
-    stretches by density g L²/(2 stretch).
+    and out of it ½ bend |κ|², with |κ|² = κ11² + κ22² + 2 κ12² of the curvature: a cylinder of radius r stores
+    bend/(2 r²), whichever way it is rolled. A strip of length L hanging under its own weight stretches by
+    density g L²/(2 stretch).
 
     Where a sheet is cut from a homogeneous isotropic material of Young's modulus E, thickness t and Poisson's ratio ν,
     stretch = E t, shear = E t/(2 (1 + ν)), bend = E t³/(12 (1 - ν²)); `isotropic` computes them. Woven cloth is no such

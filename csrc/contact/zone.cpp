@@ -10,6 +10,14 @@
 namespace diffsim {
 namespace {
 
+/// Functions as one, chosen by the type of their argument.
+template <class... Functions>
+struct Overloaded : Functions... {
+    using Functions::operator()...;
+};
+template <class... Functions>
+Overloaded(Functions...) -> Overloaded<Functions...>;
+
 /// |L⁻¹ g| of one body.
 double scaled_norm(const ZoneBody& body, const Vec6& gradient) {
     const Vec3 turn = gradient.head<3>();
@@ -388,16 +396,27 @@ void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessia
     for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
         const ZoneCloth& cloth = zone.cloths[c];
         const int first = cloth.first_node;
+        const auto add = [&](int i, int j, const Mat3& block) {
+            add_node_block(zone, first + i, first + j, block, system);
+        };
         visit_elastic_hessian(
             zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start, point.nodes.data() + first, kind,
-            [&](const auto& element) {
-                const int count = static_cast<int>(element.nodes.size());
-                for (int r = 0; r < count; ++r)
-                    for (int s = r; s < count; ++s)
-                        add_node_block(
-                            zone, first + element.nodes[static_cast<std::size_t>(r)],
-                            first + element.nodes[static_cast<std::size_t>(s)], scale * element.block(r, s), system);
-            });
+            Overloaded{
+                [&](const CouplingHessian& coupling) {
+                    for (int a = 0; a < 4; ++a) {
+                        for (int b = 0; b < 4; ++b) {
+                            const int i = coupling.nodes_a[a], j = coupling.nodes_b[b];
+                            const Mat3 block = scale * coupling.block(a, b);
+                            add(i, j, i == j ? Mat3(block + block.transpose()) : block);
+                        }
+                    }
+                },
+                [&](const auto& element) {
+                    const int count = static_cast<int>(element.nodes.size());
+                    for (int r = 0; r < count; ++r)
+                        for (int s = r; s < count; ++s)
+                            add(element.nodes[r], element.nodes[s], scale * element.block(r, s));
+                }});
     }
 }
 

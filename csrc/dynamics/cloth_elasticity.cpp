@@ -2,8 +2,6 @@
 
 #include <cmath>
 
-#include "geometry/dihedral.hpp"
-
 namespace diffsim {
 namespace {
 
@@ -87,9 +85,52 @@ void scatter(const ClothHinge& hinge, const Mat34& values, Vec3* result) {
     for (int k = 0; k < 4; ++k) result[hinge.nodes[k]] += values.col(k);
 }
 
-/// Elastic plus damping moment per bend * weight, at a hinge that is not degenerate [rad].
+/// Elastic plus damping angle, at a hinge that is not degenerate [rad].
 double step_angle(const ElasticLaw& law, const ClothHinge& hinge, double angle, double angle_start) {
     return wrap_angle(angle - hinge.rest_angle) + law.damping_over_dt * wrap_angle(angle - angle_start);
+}
+
+/// W angles
+std::vector<double> times_weights(const Cloth& cloth, const std::vector<double>& angles) {
+    std::vector<double> result(angles.size());
+    for (std::size_t h = 0; h < angles.size(); ++h) result[h] = cloth.hinges[h].weight * angles[h];
+    for (const HingeCoupling& coupling : cloth.couplings) {
+        result[coupling.a] += coupling.weight * angles[coupling.b];
+        result[coupling.b] += coupling.weight * angles[coupling.a];
+    }
+    return result;
+}
+
+double dot(const std::vector<double>& a, const std::vector<double>& b) {
+    double sum = 0.0;
+    for (std::size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
+    return sum;
+}
+
+/// How far each hinge is bent and was bent in the step; nothing where it is degenerate.
+struct HingeAngles {
+    std::vector<double> bent, change;  ///< from rest, from the start [rad]
+};
+
+/// How fast each angle changes along a direction of the nodes.
+std::vector<double> angle_changes(const Cloth& cloth, const std::vector<Mat34>& gradients, const Vec3* direction) {
+    std::vector<double> changes;
+    for (std::size_t h = 0; h < gradients.size(); ++h)
+        changes.push_back(gradients[h].cwiseProduct(gather(cloth.hinges[h], direction)).sum());
+    return changes;
+}
+
+HingeAngles hinge_angles(const Cloth& cloth, const ElasticStart& start, const Vec3* x) {
+    HingeAngles angles;
+    angles.bent.assign(cloth.hinges.size(), 0.0);
+    angles.change.assign(cloth.hinges.size(), 0.0);
+    for (std::size_t h = 0; h < cloth.hinges.size(); ++h) {
+        const DihedralFrame frame = dihedral_frame(gather(cloth.hinges[h], x));
+        if (frame.degenerate) continue;
+        angles.bent[h] = wrap_angle(frame.angle - cloth.hinges[h].rest_angle);
+        angles.change[h] = wrap_angle(frame.angle - start.angle[h]);
+    }
+    return angles;
 }
 
 }  // namespace
@@ -112,21 +153,17 @@ ElasticStart elastic_start(const Cloth& cloth, const Vec3* x_start) {
 double elastic_energy(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x) {
     const ElasticLaw law = elastic_law(cloth, parameters, dt);
-    double membrane = 0.0, bending = 0.0;
+    double membrane = 0.0;
     for (std::size_t t = 0; t < cloth.triangles.size(); ++t) {
         const ClothTriangle& triangle = cloth.triangles[t];
         const Vec3 strain = green_strain(deformation(triangle, x)), change = strain - start.strain[t];
         membrane += triangle.area * (contract(stress(law, strain), strain) +
                                      law.damping_over_dt * contract(stress(law, change), change));
     }
-    for (std::size_t h = 0; h < cloth.hinges.size(); ++h) {
-        const ClothHinge& hinge = cloth.hinges[h];
-        const DihedralFrame frame = dihedral_frame(gather(hinge, x));
-        if (frame.degenerate) continue;
-        const double bent = wrap_angle(frame.angle - hinge.rest_angle);
-        const double change = wrap_angle(frame.angle - start.angle[h]);
-        bending += hinge.weight * (bent * bent + law.damping_over_dt * change * change);
-    }
+    const HingeAngles angles = hinge_angles(cloth, start, x);
+    double bending = dot(angles.bent, times_weights(cloth, angles.bent));
+    if (law.damping_over_dt > 0.0)
+        bending += law.damping_over_dt * dot(angles.change, times_weights(cloth, angles.change));
     return 0.5 * (membrane + law.bend * bending);
 }
 
@@ -140,13 +177,9 @@ void add_elastic_gradient(
         const Vec3 S = step_stress(law, green_strain(F), start.strain[t]);
         add_nodal(triangle, times_tensor(F, S), scale * triangle.area, gradient);
     }
-    for (std::size_t h = 0; h < cloth.hinges.size(); ++h) {
-        const ClothHinge& hinge = cloth.hinges[h];
-        const DihedralFrame frame = dihedral_frame(gather(hinge, x));
-        if (frame.degenerate) continue;
-        const double moment = law.bend * hinge.weight * step_angle(law, hinge, frame.angle, start.angle[h]);
-        scatter(hinge, scale * moment * dihedral_gradient(frame), gradient);
-    }
+    const BentHinges bent = bent_hinges(cloth, law, start, x);
+    for (std::size_t h = 0; h < cloth.hinges.size(); ++h)
+        scatter(cloth.hinges[h], scale * bent.moments[h] * bent.gradients[h], gradient);
 }
 
 void add_elastic_hessian_product(
@@ -164,15 +197,13 @@ void add_elastic_hessian_product(
         const Deformation dP{by_geometry.warp + by_stress.warp, by_geometry.weft + by_stress.weft};
         add_nodal(triangle, dP, scale * triangle.area, product);
     }
+    const BentHinges bent = bent_hinges(cloth, law, start, x);
+    const std::vector<double> weighed = times_weights(cloth, angle_changes(cloth, bent.gradients, direction));
     for (std::size_t h = 0; h < cloth.hinges.size(); ++h) {
         const ClothHinge& hinge = cloth.hinges[h];
-        const DihedralFrame frame = dihedral_frame(gather(hinge, x));
-        if (frame.degenerate) continue;
-        const Mat34 change = gather(hinge, direction), gradient = dihedral_gradient(frame);
-        const double stiffness = law.bend * hinge.weight;
-        const double moment = stiffness * step_angle(law, hinge, frame.angle, start.angle[h]);
-        const double moment_change = gain * stiffness * gradient.cwiseProduct(change).sum();
-        scatter(hinge, scale * (moment_change * gradient + moment * dihedral_hessian_product(frame, change)), product);
+        const double moment_change = gain * law.bend * weighed[h];
+        const Mat34 bending = dihedral_hessian_product(bent.frames[h], gather(hinge, direction));
+        scatter(hinge, scale * (moment_change * bent.gradients[h] + bent.moments[h] * bending), product);
     }
 }
 
@@ -198,18 +229,19 @@ ClothParameters add_elastic_backward(
         add_nodal(
             triangle, times_tensor(deformation(triangle, x_start), stress_along), -law.damping_over_dt, grad_x_start);
     }
+    // s = bend dθ · W (θ - θ0 + damping / dt (θ - θ_start)), with dθ along the direction.
+    const BentHinges bent = bent_hinges(cloth, law, start, x);
+    const HingeAngles angles = hinge_angles(cloth, start, x);
+    std::vector<double> along = times_weights(cloth, angle_changes(cloth, bent.gradients, direction));
+    for (double& value : along) value *= scale;
+    grad.bend += dot(along, angles.bent) + law.damping_over_dt * dot(along, angles.change);
+    grad.damping += law.bend * dot(along, angles.change) / dt;
+    if (law.damping_over_dt == 0.0) return grad;
     for (std::size_t h = 0; h < cloth.hinges.size(); ++h) {
         const ClothHinge& hinge = cloth.hinges[h];
-        const DihedralFrame frame = dihedral_frame(gather(hinge, x));
-        if (frame.degenerate) continue;
-        // s = bend weight dθ (θ - θ0 + damping / dt (θ - θ_start)), with dθ along the direction.
-        const double angle_change = dihedral_gradient(frame).cwiseProduct(gather(hinge, direction)).sum();
-        const double along = scale * hinge.weight * angle_change;
-        grad.bend += along * step_angle(law, hinge, frame.angle, start.angle[h]);
-        grad.damping += law.bend * along * wrap_angle(frame.angle - start.angle[h]) / dt;
-        if (law.damping_over_dt == 0.0) continue;
+        if (bent.frames[h].degenerate) continue;
         const DihedralFrame frame_start = dihedral_frame(gather(hinge, x_start));
-        scatter(hinge, -law.damping_over_dt * law.bend * along * dihedral_gradient(frame_start), grad_x_start);
+        scatter(hinge, -law.damping_over_dt * law.bend * along[h] * dihedral_gradient(frame_start), grad_x_start);
     }
     return grad;
 }
@@ -255,27 +287,39 @@ ElementHessian<3> triangle_hessian(
     return element;
 }
 
+BentHinges bent_hinges(const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x) {
+    BentHinges bent;
+    bent.frames.reserve(cloth.hinges.size());
+    bent.gradients.reserve(cloth.hinges.size());
+    std::vector<double> angles(cloth.hinges.size(), 0.0);
+    for (std::size_t h = 0; h < cloth.hinges.size(); ++h) {
+        const DihedralFrame& frame = bent.frames.emplace_back(dihedral_frame(gather(cloth.hinges[h], x)));
+        bent.gradients.push_back(dihedral_gradient(frame));
+        if (!frame.degenerate) angles[h] = law.bend * step_angle(law, cloth.hinges[h], frame.angle, start.angle[h]);
+    }
+    bent.moments = times_weights(cloth, angles);
+    return bent;
+}
+
 ElementHessian<4> hinge_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int id, ElasticHessian kind) {
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int id, ElasticHessian kind) {
     const ClothHinge& hinge = cloth.hinges[id];
     ElementHessian<4> element;
     element.id = id;
     element.nodes = hinge.nodes;
-    const DihedralFrame frame = dihedral_frame(gather(hinge, x));
-    if (frame.degenerate) {
-        element.matrix.setZero();
-        return element;
-    }
-    const Mat34 gradient = dihedral_gradient(frame);
-    const Eigen::Map<const Vec12> row(gradient.data());
-    const double stiffness = law.bend * hinge.weight;
-    const Vec12 stiff_row = stiffness * (1.0 + law.damping_over_dt) * row;
+    const Eigen::Map<const Vec12> row(bent.gradients[id].data());
+    const Vec12 stiff_row = law.bend * hinge.weight * (1.0 + law.damping_over_dt) * row;
     element.matrix.noalias() = stiff_row * row.transpose();
-    if (kind == ElasticHessian::exact) {
-        const double moment = stiffness * step_angle(law, hinge, frame.angle, start.angle[id]);
-        element.matrix += moment * dihedral_hessian(frame);
-    }
+    if (kind == ElasticHessian::exact) element.matrix += bent.moments[id] * dihedral_hessian(bent.frames[id]);
     return element;
+}
+
+CouplingHessian coupling_hessian(
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, const HingeCoupling& coupling) {
+    const double stiffness = law.bend * coupling.weight * (1.0 + law.damping_over_dt);
+    return {
+        cloth.hinges[coupling.a].nodes, cloth.hinges[coupling.b].nodes, stiffness * bent.gradients[coupling.a],
+        bent.gradients[coupling.b]};
 }
 
 }  // namespace diffsim

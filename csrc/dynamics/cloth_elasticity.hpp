@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "geometry/dihedral.hpp"
 #include "model/cloth.hpp"
 
 /// The elastic potential of one cloth over one step of implicit Euler, with its derivatives. Nodes are those of the
@@ -9,8 +10,8 @@
 ///
 /// Membrane, per triangle with deformation gradient F (3 x 2) and Green strain ε = ½ (FᵀF - 1):
 ///   W(ε) = ½ E / (1 - ν²) (ε11² + ε22² + 2 ν ε11 ε22) + ½ G (2 ε12)²,  times the area at rest,
-/// with E = stretch, G = shear. Bending, per hinge with dihedral angle θ and rest angle θ0:
-///   ½ bend weight (θ - θ0)².
+/// with E = stretch, G = shear. Bending, over all pairs of hinges with dihedral angles θ and rest angles θ0:
+///   ½ bend Σ W_ij (θ_i - θ0_i) (θ_j - θ0_j),  W from model/hinge_weights.hpp.
 /// Kelvin–Voigt damping, as the gain damping / dt on the same two forms of the change over the step, ε - ε_start and
 /// θ - θ_start, so that the step stays a minimization. Differences of angles are taken in (-π, π]: springs take the
 /// shorter way round, and the energy has a kink at half a turn.
@@ -19,7 +20,7 @@
 /// while that lasts the hinge contributes nothing, and at the start of a step it counts as flat. All else is finite,
 /// though a hinge's forces grow as its triangles' heights fall.
 ///
-/// Sums run in the order of triangles, then hinges: results depend on the input alone.
+/// Sums run in the order of triangles, then hinges, then couplings: results depend on the input alone.
 namespace diffsim {
 
 /// Strains at the start of a step, which its damping is measured from.
@@ -58,8 +59,9 @@ ClothParameters add_elastic_backward(
 ///    semidefinite exactly when S is: `projected` cuts S to its positive part, for a square root. Clamping the
 ///    eigenvalues of the 9 x 9 matrix would differ within the triangle's plane, by the cut stress beside the stiffness,
 ///    which is of the order of the strain.
-///  - Hinges: k ∇θ ∇θᵀ + moment ∇²θ. Any moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ
-///    with that away from the edge, against which the hinge has no stiffness. `projected` drops the moment's term.
+///  - Bending: bend Σ W_ij ∇θ_i ∇θ_jᵀ, semidefinite as a sum over all hinges and couplings, plus Σ moment_i ∇²θ_i. Any
+///    moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ with that away from the edge, against which
+///    the hinge has no stiffness. `projected` drops the moments' term.
 /// Clamping eigenvalues instead would take some 4 µs per triangle and 7 µs per hinge, thirty times as long or more.
 enum class ElasticHessian { exact, projected };
 
@@ -75,6 +77,16 @@ struct ElementHessian {
     auto block(int row, int column) const { return matrix.template block<3, 3>(3 * row, 3 * column); }
 };
 
+/// The same of two coupled hinges: k (∇θ_a ∇θ_bᵀ + ∇θ_b ∇θ_aᵀ).
+struct CouplingHessian {
+    const std::array<int, 4>&nodes_a, &nodes_b;  ///< of the cloth; some are in both
+    Mat34 row_a;                                 ///< k ∇θ_a
+    const Mat34& row_b;                          ///< ∇θ_b
+
+    /// Block of a node of a and a node of b; its transpose is the block of the node of b and that of a.
+    Mat3 block(int a, int b) const { return row_a.col(a) * row_b.col(b).transpose(); }
+};
+
 /// What all elements of one cloth and step have in common.
 struct ElasticLaw {
     double c11, c12;         ///< of stress from ε11 and ε22 [N/m]
@@ -85,22 +97,35 @@ struct ElasticLaw {
 
 ElasticLaw elastic_law(const Cloth& cloth, const ClothParameters& parameters, double dt);
 
+/// The hinges of a cloth as the energy's derivatives need them.
+struct BentHinges {
+    std::vector<DihedralFrame> frames;
+    std::vector<Mat34> gradients;  ///< of the angles [rad/m]
+    std::vector<double> moments;   ///< derivative of the energy by each angle [N·m]
+};
+
+BentHinges bent_hinges(const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x);
+
 ElementHessian<3> triangle_hessian(
     const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int triangle,
     ElasticHessian kind);
 ElementHessian<4> hinge_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int hinge,
-    ElasticHessian kind);
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int hinge, ElasticHessian kind);
+CouplingHessian coupling_hessian(
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, const HingeCoupling& coupling);
 
-/// Call visit(element) with every triangle's ElementHessian<3>, then every hinge's ElementHessian<4>.
+/// Call visit(element) with every triangle's ElementHessian<3>, then every hinge's ElementHessian<4>, then every
+/// CouplingHessian.
 template <class Visit>
 void visit_elastic_hessian(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
     ElasticHessian kind, Visit&& visit) {
     const ElasticLaw law = elastic_law(cloth, parameters, dt);
+    const BentHinges bent = bent_hinges(cloth, law, start, x);
     for (int t = 0; t < static_cast<int>(cloth.triangles.size()); ++t)
         visit(triangle_hessian(cloth, law, start, x, t, kind));
-    for (int h = 0; h < static_cast<int>(cloth.hinges.size()); ++h) visit(hinge_hessian(cloth, law, start, x, h, kind));
+    for (int h = 0; h < static_cast<int>(cloth.hinges.size()); ++h) visit(hinge_hessian(cloth, law, bent, h, kind));
+    for (const HingeCoupling& coupling : cloth.couplings) visit(coupling_hessian(cloth, law, bent, coupling));
 }
 
 }  // namespace diffsim

@@ -64,8 +64,34 @@ ClothHinge build_hinge(const Cloth& cloth, const std::pair<int, int>& edge, cons
     Mat34 points;
     for (int k = 0; k < 4; ++k) points.col(k) = cloth.rest[hinge.nodes[k]];
     hinge.rest_angle = dihedral_frame(points).angle;
-    hinge.weight = kHingeRelaxation * (points.col(1) - points.col(0)).squaredNorm() / (a.area + b.area);
+    hinge.weight = 0.0;  // follows from all of them
     return hinge;
+}
+
+/// Weights and couplings of the hinges, each between the two triangles `around` it.
+void weigh_hinges(Cloth& cloth, const std::vector<std::array<int, 2>>& around) {
+    std::vector<std::array<int, 3>> triangles;
+    for (const ClothTriangle& triangle : cloth.triangles) triangles.push_back(triangle.nodes);
+    std::vector<RestHinge> hinges;
+    for (std::size_t h = 0; h < around.size(); ++h) hinges.push_back({cloth.hinges[h].nodes, around[h]});
+    HingeWeights weights = hinge_weights(cloth.rest, triangles, hinges);
+    for (std::size_t h = 0; h < around.size(); ++h) cloth.hinges[h].weight = weights.diagonal[h];
+    cloth.couplings = std::move(weights.couplings);
+}
+
+/// Every pair of nodes of one element.
+void list_node_pairs(Cloth& cloth) {
+    const auto couple = [&](const auto& nodes_a, const auto& nodes_b) {
+        for (const int i : nodes_a)
+            for (const int j : nodes_b)
+                if (i != j) cloth.node_pairs.emplace_back(std::min(i, j), std::max(i, j));
+    };
+    for (const ClothTriangle& triangle : cloth.triangles) couple(triangle.nodes, triangle.nodes);
+    for (const ClothHinge& hinge : cloth.hinges) couple(hinge.nodes, hinge.nodes);
+    for (const HingeCoupling& coupling : cloth.couplings)
+        couple(cloth.hinges[coupling.a].nodes, cloth.hinges[coupling.b].nodes);
+    std::sort(cloth.node_pairs.begin(), cloth.node_pairs.end());
+    cloth.node_pairs.erase(std::unique(cloth.node_pairs.begin(), cloth.node_pairs.end()), cloth.node_pairs.end());
 }
 
 }  // namespace
@@ -90,22 +116,18 @@ Cloth build_cloth(std::vector<Vec3> rest, const std::vector<Triangle>& triangles
     for (std::size_t node = 0; node < node_count; ++node)
         if (cloth.node_area[node] == 0.0)
             throw std::invalid_argument("node " + std::to_string(node) + " belongs to no triangle");
+    std::vector<std::array<int, 2>> around_hinge;
     for (const auto& [edge, around] : collect_edge_faces(triangles)) {
         if (around.size() > 2)
             throw std::invalid_argument(
                 "edge (" + std::to_string(edge.first) + ", " + std::to_string(edge.second) + ") belongs to " +
                 std::to_string(around.size()) + " triangles, at most two can meet");
-        if (around.size() == 2) cloth.hinges.push_back(build_hinge(cloth, edge, around));
+        if (around.size() < 2) continue;
+        cloth.hinges.push_back(build_hinge(cloth, edge, around));
+        around_hinge.push_back({around[0], around[1]});
     }
-    const auto couple = [&](const auto& nodes) {
-        for (std::size_t i = 0; i < nodes.size(); ++i)
-            for (std::size_t j = i + 1; j < nodes.size(); ++j)
-                cloth.node_pairs.emplace_back(std::min(nodes[i], nodes[j]), std::max(nodes[i], nodes[j]));
-    };
-    for (const ClothTriangle& triangle : cloth.triangles) couple(triangle.nodes);
-    for (const ClothHinge& hinge : cloth.hinges) couple(hinge.nodes);
-    std::sort(cloth.node_pairs.begin(), cloth.node_pairs.end());
-    cloth.node_pairs.erase(std::unique(cloth.node_pairs.begin(), cloth.node_pairs.end()), cloth.node_pairs.end());
+    weigh_hinges(cloth, around_hinge);
+    list_node_pairs(cloth);
     cloth.surface = build_collision_mesh(cloth.rest, triangles, Faces::separate);
     return cloth;
 }

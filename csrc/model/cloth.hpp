@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "geometry/collision_mesh.hpp"
+#include "model/hinge_weights.hpp"
 
 /// What a sheet of cloth is made of. Constant over time.
 namespace diffsim {
@@ -15,17 +16,11 @@ struct ClothTriangle {
     double area;                   ///< at rest [m²]
 };
 
-/// Hinges with weights |edge|² / (sum of areas) give a grid or an equilateral mesh that is held to a cylinder the energy
-/// ½ bend κ² per area. Left to itself a grid of squares folds them a little along their diagonals as well: with B the bending
-/// stiffness, K the cylinder's angle at a grid line and t that of the folds, ½ B ((K + t)² + t² + 4 t²) per square has its
-/// minimum 5/6 · ½ B K² at t = -K/6. This factor gives a bent strip the moment bend κ per width.
-inline constexpr double kHingeRelaxation = 1.2;
-
 /// Two triangles that share an edge, and the spring between them.
 struct ClothHinge {
     std::array<int, 4> nodes;  ///< ends p0 < p1 of the shared edge, then the opposite corners of its two triangles
     double rest_angle;         ///< dihedral angle at rest, 0 where flat (geometry/dihedral.hpp) [rad]
-    double weight;             ///< kHingeRelaxation |edge|² / (sum of both triangles' areas), at rest [1]
+    double weight;  ///< stiffness in units of the cloth's, if no other hinge is bent (model/hinge_weights.hpp) [1]
 };
 
 struct Cloth {
@@ -38,7 +33,8 @@ struct Cloth {
     std::vector<double> node_area;         ///< a third of the area of the triangles around each node, at rest [m²]
     std::vector<ClothTriangle> triangles;  ///< as given
     std::vector<ClothHinge> hinges;        ///< in the order of their edges
-    std::vector<std::pair<int, int>> node_pairs;  ///< i < j, sorted: nodes that some triangle or hinge couples
+    std::vector<HingeCoupling> couplings;  ///< between hinges next to each other
+    std::vector<std::pair<int, int>> node_pairs;  ///< i < j, sorted: nodes that some triangle or hinges couple
     CollisionMesh surface;                        ///< topology for collision: triangles unmerged, every edge
 
     int node_count() const { return static_cast<int>(rest.size()); }
