@@ -210,14 +210,16 @@ private:
             Zone& zone = new_zone(memory, origin_of(m_model.body_count() + c));
             zone.contacts_off = true;
             add_cloth(zone, c, m_state, m_control, m_parameters);
-            const ZoneResult result = solve_zone(zone, nobody, zone_options(), memory.workspace, memory.visited);
+            ZoneOptions options = zone_options();
+            options.full_steps = m_options.newton_iterations;
+            const ZoneResult result = solve_zone(zone, nobody, options, memory.workspace, memory.visited);
             note(result);
             const int first = m_model.cloths[c].first_node;
             for (int i = 0; i < zone.node_count(); ++i) m.elastic_shift[first + i] = memory.workspace.point.y.nodes[i];
         }
     }
 
-    ZoneOptions zone_options() const { return {m_options.tolerance, m_options.max_iterations}; }
+    ZoneOptions zone_options() const { return {m_options.tolerance, m_options.max_iterations, std::nullopt}; }
 
     Vec3 origin_of(int object) const {
         return m_model.is_cloth(object) ? m_state.node_position[m_model.cloth_of(object).first_node]

@@ -42,6 +42,9 @@ class Model:
     def cloth_count(self) -> int: ...
     @property
     def node_count(self) -> int: ...
+    def hinges(
+        self,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]: ...
 
 class Options:
     """How steps are taken."""
@@ -56,6 +59,7 @@ class Options:
         max_iterations: int = 200,
         coupling: str = "monolithic",
         zones: str = "local",
+        newton_iterations: int | None = None,
     ) -> None: ...
     dt: float
     compliance: float
@@ -64,6 +68,8 @@ class Options:
     max_iterations: int
     coupling: str
     zones: str
+    @property
+    def newton_iterations(self) -> int | None: ...
 
 class Tape:
     """What the backward of a rollout needs."""

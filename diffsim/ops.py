@@ -168,6 +168,11 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        if ctx.call.options.newton_iterations is not None:
+            raise NotImplementedError(
+                "diffsim: there are no gradients through newton_iterations: where Newton's method is cut short they"
+                " take third derivatives of the elastic energy; leave it at None, or step under torch.no_grad()"
+            )
         call = _BackwardCall(ctx.call, ctx.needs_input_grad[1:])
         if torch.is_grad_enabled() or _transforms_active():
             return None, *_RolloutBackward.apply(call, *ctx.saved_tensors, *grads)

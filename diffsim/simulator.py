@@ -74,6 +74,10 @@ class Simulator(Measurements):
             step first and its contacts after it, as the paper does. Without cloth the two are the same.
         zones: "local": bodies and cloths are solved together only if they may meet, the default. "global": all at once,
             the same result for more work; there to measure what locality saves.
+        newton_iterations: Newton iterates that make up the elastic step of ``coupling="split"``, full steps from no
+            motion, with the exact Hessian, or its projection where that is not positive definite. 1 is the paper's
+            Eq. 3. Meant to show what that leaves out: there are no gradients, and `info.converged` does not speak of
+            these iterates. Default: as many as it takes to converge.
         tolerance: Relative KKT residual at which a step has converged.
         max_iterations: Newton iterations a step may take. Default: 200, in scenes with cloth 2000.
         num_threads: How many threads a call may use; no result depends on it. They divide the scenes of a batch, or,
@@ -105,6 +109,7 @@ class Simulator(Measurements):
         adjoint: str = "exact",
         coupling: str = "monolithic",
         zones: str = "local",
+        newton_iterations: int | None = None,
         tolerance: float = 1e-10,
         max_iterations: int | None = None,
         num_threads: int | None = None,
@@ -127,6 +132,7 @@ class Simulator(Measurements):
             "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
             "coupling": coupling,
             "zones": zones,
+            "newton_iterations": _checked_iterations(newton_iterations, coupling),
         }
         self._num_threads = None if num_threads is None else check_count(where, "num_threads", num_threads)
         self._on_failure = on_failure
@@ -173,7 +179,7 @@ class Simulator(Measurements):
             pinned=p.pinned,
         )
         self._options = _core.Options(**self._settings)
-        self._elements = cloth_elements(p) if p.cloth_names else None
+        self._elements = cloth_elements(p, self._model) if p.cloth_names else None
         n = self._body_count = len(p.names)
         self._node_count = len(p.node_rest)
         self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
@@ -489,6 +495,18 @@ class Simulator(Measurements):
         stage("cloth", no_cloth)
         stage("cloth contact", no_cloth)
         return runs, left_out
+
+
+def _checked_iterations(count: int | None, coupling: str) -> int | None:
+    if count is None:
+        return None
+    count = check_count("Simulator", "newton_iterations", count)
+    if coupling != "split":
+        raise ValueError(
+            f"Simulator: newton_iterations must be None with coupling={coupling!r}, got {count}: only the elastic step"
+            ' of coupling="split" can be cut short, contact needs a converged one'
+        )
+    return count
 
 
 def _unwrapped_values(tensor: Tensor) -> np.ndarray:

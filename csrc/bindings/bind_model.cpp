@@ -112,6 +112,32 @@ std::shared_ptr<Model> make_model(
     return model;
 }
 
+py::tuple hinges(const Model& model) {
+    py::ssize_t hinge_count = 0, coupling_count = 0;
+    for (const Cloth& cloth : model.cloths) {
+        hinge_count += static_cast<py::ssize_t>(cloth.hinges.size());
+        coupling_count += static_cast<py::ssize_t>(cloth.couplings.size());
+    }
+    py::array_t<std::int64_t> nodes({hinge_count, py::ssize_t{4}}), pairs({coupling_count, py::ssize_t{2}});
+    Array rest_angle(hinge_count), weight(hinge_count), pair_weight(coupling_count);
+    py::ssize_t first_hinge = 0, coupling = 0;
+    for (const Cloth& cloth : model.cloths) {
+        py::ssize_t row = first_hinge;
+        for (const ClothHinge& hinge : cloth.hinges) {
+            for (int k = 0; k < 4; ++k) nodes.mutable_at(row, k) = cloth.first_node + hinge.nodes[k];
+            rest_angle.mutable_at(row) = hinge.rest_angle;
+            weight.mutable_at(row++) = hinge.weight;
+        }
+        for (const HingeCoupling& entry : cloth.couplings) {
+            pairs.mutable_at(coupling, 0) = first_hinge + entry.a;
+            pairs.mutable_at(coupling, 1) = first_hinge + entry.b;
+            pair_weight.mutable_at(coupling++) = entry.weight;
+        }
+        first_hinge = row;
+    }
+    return py::make_tuple(nodes, rest_angle, weight, pairs, pair_weight);
+}
+
 AdjointMode parse_adjoint(const std::string& text) {
     if (text == "exact") return AdjointMode::exact;
     if (text == "qr") return AdjointMode::qr;
@@ -153,13 +179,19 @@ void bind_model(py::module_& module) {
             py::arg("node_rest").noconvert(), py::arg("warp").noconvert(), py::arg("pinned").noconvert())
         .def_property_readonly("body_count", &Model::body_count)
         .def_property_readonly("cloth_count", &Model::cloth_count)
-        .def_property_readonly("node_count", &Model::node_count);
+        .def_property_readonly("node_count", &Model::node_count)
+        .def(
+            "hinges", &hinges,
+            "Of all cloths: nodes, angles at rest and weights of the hinges, pairs of coupled hinges and their "
+            "weights.");
 
     const Options defaults;
     py::class_<Options>(module, "Options", "How steps are taken.")
         .def(
             py::init([](double dt, double compliance, const std::string& adjoint, double tolerance, int max_iterations,
-                        const std::string& coupling, const std::string& zones) {
+                        const std::string& coupling, const std::string& zones, std::optional<int> newton_iterations) {
+                if (newton_iterations && !parse_coupling(coupling))
+                    throw std::invalid_argument("newton_iterations needs coupling 'split'");
                 Options options;
                 options.dt = dt;
                 options.compliance = compliance;
@@ -168,12 +200,14 @@ void bind_model(py::module_& module) {
                 options.max_iterations = max_iterations;
                 options.split = parse_coupling(coupling);
                 options.global_zone = parse_zones(zones);
+                options.newton_iterations = newton_iterations;
                 return options;
             }),
             py::kw_only(), py::arg("dt"), py::arg("compliance") = defaults.compliance,
             py::arg("adjoint") = adjoint_text(defaults.adjoint), py::arg("tolerance") = defaults.tolerance,
             py::arg("max_iterations") = defaults.max_iterations, py::arg("coupling") = coupling_text(defaults.split),
-            py::arg("zones") = zones_text(defaults.global_zone))
+            py::arg("zones") = zones_text(defaults.global_zone),
+            py::arg("newton_iterations") = defaults.newton_iterations)
         .def_readwrite("dt", &Options::dt)
         .def_readwrite("compliance", &Options::compliance)
         .def_readwrite("tolerance", &Options::tolerance)
@@ -186,7 +220,8 @@ void bind_model(py::module_& module) {
             [](Options& options, const std::string& text) { options.split = parse_coupling(text); })
         .def_property(
             "zones", [](const Options& options) { return zones_text(options.global_zone); },
-            [](Options& options, const std::string& text) { options.global_zone = parse_zones(text); });
+            [](Options& options, const std::string& text) { options.global_zone = parse_zones(text); })
+        .def_readonly("newton_iterations", &Options::newton_iterations);
 }
 
 }  // namespace diffsim::bindings

@@ -36,6 +36,10 @@ public:
 
     ZoneResult solve() {
         start();
+        if (m_options.full_steps) {
+            take_full_steps(*m_options.full_steps);
+            return m_result;
+        }
         if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
         go_to_warm_start();
         iterate();
@@ -354,6 +358,23 @@ private:
                 return;
             }
         }
+    }
+
+    /// (M + dt² K) Δy = -dE/dy, so often. From y = 0 that is  (M + dt² K) v1 = M v0 + dt f  [Qiao et al. 2020, Eq. 3].
+    void take_full_steps(int count) {
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (m_zone.nodes[i].pinned) y().nodes[i] = m_zone.nodes[i].target;
+        evaluate(m_zone, m_w.point);
+        for (m_result.iterations = 0; m_result.iterations < count; ++m_result.iterations) {
+            if (!newton_step()) return fail(ZoneStatus::no_descent);
+            m_w.trial.y = y();
+            for (int i = 0; i < m_zone.node_count(); ++i) m_w.trial.y.nodes[i] += m_w.step.nodes[i];
+            evaluate(m_zone, m_w.trial);
+            if (!std::isfinite(m_w.trial.energy)) return fail(ZoneStatus::no_descent);
+            std::swap(m_w.point, m_w.trial);
+        }
+        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        m_result.residual = accuracy().residual;
     }
 
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.

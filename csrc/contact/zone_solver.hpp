@@ -1,5 +1,7 @@
 #pragma once
 
+#include <optional>
+
 #include "contact/impact_qp.hpp"
 
 namespace diffsim {
@@ -16,6 +18,9 @@ enum class ZoneStatus {
 struct ZoneOptions {
     double tolerance = 1e-10;  ///< on the residual
     int max_iterations = 200;
+    /// Take this many full Newton steps, whether or not they lower the energy: for a zone without bodies and contacts, whose
+    /// pinned nodes are at their targets from the first. Once from rest is Eq. 3 of [Qiao et al. 2020].
+    std::optional<int> full_steps;
 };
 
 struct ZoneResult {

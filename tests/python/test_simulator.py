@@ -40,6 +40,13 @@ def state(sim: ds.Simulator) -> ds.State:
         ({"adjoint": "fast"}, ValueError, "adjoint must be one of 'exact', 'qr', 'dense', got 'fast'"),
         ({"coupling": "none"}, ValueError, "coupling must be one of 'monolithic', 'split', got 'none'"),
         ({"zones": "none"}, ValueError, "zones must be one of 'local', 'global', got 'none'"),
+        ({"newton_iterations": 0}, ValueError, "newton_iterations must be at least 1, got 0"),
+        ({"newton_iterations": 1.5}, TypeError, "newton_iterations must be a whole number, got float"),
+        (
+            {"newton_iterations": 1},
+            ValueError,
+            "Simulator: newton_iterations must be None with coupling='monolithic', got 1",
+        ),
         ({"tolerance": 0.0}, ValueError, "tolerance must be finite and larger than 0"),
         ({"max_iterations": 0}, ValueError, "max_iterations must be at least 1, got 0"),
         ({"max_iterations": 2.5}, TypeError, "max_iterations must be a whole number, got float"),
