@@ -402,20 +402,21 @@ void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessia
         visit_elastic_hessian(
             zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start, point.nodes.data() + first, kind,
             Overloaded{
-                [&](const CouplingHessian& coupling) {
-                    for (int a = 0; a < 4; ++a) {
-                        for (int b = 0; b < 4; ++b) {
-                            const int i = coupling.nodes_a[a], j = coupling.nodes_b[b];
-                            const Mat3 block = scale * coupling.block(a, b);
-                            add(i, j, i == j ? Mat3(block + block.transpose()) : block);
-                        }
-                    }
-                },
-                [&](const auto& element) {
-                    const int count = static_cast<int>(element.nodes.size());
-                    for (int r = 0; r < count; ++r)
-                        for (int s = r; s < count; ++s)
+                [&](const TriangleHessian& element) {
+                    for (int r = 0; r < 3; ++r)
+                        for (int s = r; s < 3; ++s)
                             add(element.nodes[r], element.nodes[s], scale * element.block(r, s));
+                },
+                [&](const HingeHessian& element) {
+                    const int count = static_cast<int>(element.nodes.size());
+                    for (int r = 0; r < 4; ++r) {
+                        for (int s = r; s < 4; ++s) {
+                            const Mat3 both = element.block(r, s) + element.block(s, r).transpose();
+                            add(element.nodes[r], element.nodes[s], scale * both);
+                        }
+                        for (int s = 4; s < count; ++s)
+                            add(element.nodes[r], element.nodes[s], scale * element.block(r, s));
+                    }
                 }});
     }
 }

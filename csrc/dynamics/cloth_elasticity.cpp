@@ -1,5 +1,6 @@
 #include "dynamics/cloth_elasticity.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 namespace diffsim {
@@ -246,7 +247,7 @@ ClothParameters add_elastic_backward(
     return grad;
 }
 
-ElementHessian<3> triangle_hessian(
+TriangleHessian triangle_hessian(
     const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int id, ElasticHessian kind) {
     const ClothTriangle& triangle = cloth.triangles[id];
     const Deformation F = deformation(triangle, x);
@@ -272,7 +273,7 @@ ElementHessian<3> triangle_hessian(
     const Mat3 h11 = block(0, 0), h12 = block(0, 1), h22 = block(1, 1);
     const Mat3 h10 = -(h11 + h12), h20 = -(h12.transpose() + h22);  // a shift of all three changes nothing
 
-    ElementHessian<3> element;
+    TriangleHessian element;
     element.id = id;
     element.nodes = triangle.nodes;
     element.matrix.block<3, 3>(0, 0) = -(h10 + h20);
@@ -301,25 +302,32 @@ BentHinges bent_hinges(const Cloth& cloth, const ElasticLaw& law, const ElasticS
     return bent;
 }
 
-ElementHessian<4> hinge_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int id, ElasticHessian kind) {
+void set_hinge_hessian(
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int id, ElasticHessian kind,
+    std::size_t& coupling, HingeHessian& result) {
     const ClothHinge& hinge = cloth.hinges[id];
-    ElementHessian<4> element;
-    element.id = id;
-    element.nodes = hinge.nodes;
-    const Eigen::Map<const Vec12> row(bent.gradients[id].data());
-    const Vec12 stiff_row = law.bend * hinge.weight * (1.0 + law.damping_over_dt) * row;
-    element.matrix.noalias() = stiff_row * row.transpose();
-    if (kind == ElasticHessian::exact) element.matrix += bent.moments[id] * dihedral_hessian(bent.frames[id]);
-    return element;
-}
-
-CouplingHessian coupling_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, const HingeCoupling& coupling) {
-    const double stiffness = law.bend * coupling.weight * (1.0 + law.damping_over_dt);
-    return {
-        cloth.hinges[coupling.a].nodes, cloth.hinges[coupling.b].nodes, stiffness * bent.gradients[coupling.a],
-        bent.gradients[coupling.b]};
+    const double stiffness = law.bend * (1.0 + law.damping_over_dt);
+    result.nodes.assign(hinge.nodes.begin(), hinge.nodes.end());
+    result.gradient = bent.gradients[id];
+    result.coupled.clear();
+    for (int k = 0; k < 4; ++k) result.coupled.push_back(0.5 * stiffness * hinge.weight * result.gradient.col(k));
+    for (; coupling < cloth.couplings.size() && cloth.couplings[coupling].a == id; ++coupling) {
+        const HingeCoupling& entry = cloth.couplings[coupling];
+        for (int k = 0; k < 4; ++k) {
+            const int node = cloth.hinges[entry.b].nodes[k];
+            const auto found = std::find(result.nodes.begin(), result.nodes.end(), node);
+            const std::size_t slot = static_cast<std::size_t>(found - result.nodes.begin());
+            if (found == result.nodes.end()) {
+                result.nodes.push_back(node);
+                result.coupled.push_back(Vec3::Zero());
+            }
+            result.coupled[slot] += stiffness * entry.weight * bent.gradients[entry.b].col(k);
+        }
+    }
+    if (kind == ElasticHessian::exact)
+        result.curvature = 0.5 * bent.moments[id] * dihedral_hessian(bent.frames[id]);
+    else
+        result.curvature.setZero();
 }
 
 }  // namespace diffsim

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <utility>
 #include <vector>
 
 #include "geometry/dihedral.hpp"
@@ -65,26 +66,28 @@ ClothParameters add_elastic_backward(
 /// Clamping eigenvalues instead would take some 4 µs per triangle and 7 µs per hinge, thirty times as long or more.
 enum class ElasticHessian { exact, projected };
 
-/// Second derivative of the energy of one element by its nodes' positions [N/m].
-template <int NodeCount>
-struct ElementHessian {
-    using Matrix = Eigen::Matrix<double, 3 * NodeCount, 3 * NodeCount>;
+/// Second derivative of the energy of one triangle by its nodes' positions [N/m].
+struct TriangleHessian {
+    int id;                              ///< of the triangle in the cloth
+    std::array<int, 3> nodes;            ///< of the cloth
+    Eigen::Matrix<double, 9, 9> matrix;  ///< symmetric, in the order of the nodes
 
-    int id;                            ///< of the triangle (three nodes) or the hinge (four) in the cloth
-    std::array<int, NodeCount> nodes;  ///< of the cloth
-    Matrix matrix;                     ///< symmetric, in the order of the nodes
-
-    auto block(int row, int column) const { return matrix.template block<3, 3>(3 * row, 3 * column); }
+    auto block(int row, int column) const { return matrix.block<3, 3>(3 * row, 3 * column); }
 };
 
-/// The same of two coupled hinges: k (∇θ_a ∇θ_bᵀ + ∇θ_b ∇θ_aᵀ).
-struct CouplingHessian {
-    const std::array<int, 4>&nodes_a, &nodes_b;  ///< of the cloth; some are in both
-    Mat34 row_a;                                 ///< k ∇θ_a
-    const Mat34& row_b;                          ///< ∇θ_b
+/// The part of a hinge and of its couplings to later ones: block(r, s), in the rows of nodes[r] and the columns of nodes[s],
+/// and its transpose in the rows of nodes[s], summed over r < 4 and all s.
+struct HingeHessian {
+    std::vector<int> nodes;     ///< of the cloth: the hinge's four, then those of other hinges
+    Mat34 gradient;             ///< of the hinge's angle, ∇θ_i
+    std::vector<Vec3> coupled;  ///< per node: of bend (½ W_ii ∇θ_i + Σ W_ij ∇θ_j)
+    Mat12 curvature;            ///< ½ moment ∇²θ_i, or zero
 
-    /// Block of a node of a and a node of b; its transpose is the block of the node of b and that of a.
-    Mat3 block(int a, int b) const { return row_a.col(a) * row_b.col(b).transpose(); }
+    Mat3 block(int r, int s) const {
+        Mat3 result = gradient.col(r) * coupled[s].transpose();
+        if (s < 4) result += curvature.block<3, 3>(3 * r, 3 * s);
+        return result;
+    }
 };
 
 /// What all elements of one cloth and step have in common.
@@ -106,26 +109,30 @@ struct BentHinges {
 
 BentHinges bent_hinges(const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x);
 
-ElementHessian<3> triangle_hessian(
+TriangleHessian triangle_hessian(
     const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int triangle,
     ElasticHessian kind);
-ElementHessian<4> hinge_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int hinge, ElasticHessian kind);
-CouplingHessian coupling_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, const HingeCoupling& coupling);
 
-/// Call visit(element) with every triangle's ElementHessian<3>, then every hinge's ElementHessian<4>, then every
-/// CouplingHessian.
+/// Of the hinge whose couplings begin at `coupling`, which is moved on to those of the next.
+void set_hinge_hessian(
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int hinge, ElasticHessian kind,
+    std::size_t& coupling, HingeHessian& result);
+
+/// Call visit(element) with every TriangleHessian, then every HingeHessian.
 template <class Visit>
 void visit_elastic_hessian(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
     ElasticHessian kind, Visit&& visit) {
     const ElasticLaw law = elastic_law(cloth, parameters, dt);
-    const BentHinges bent = bent_hinges(cloth, law, start, x);
     for (int t = 0; t < static_cast<int>(cloth.triangles.size()); ++t)
         visit(triangle_hessian(cloth, law, start, x, t, kind));
-    for (int h = 0; h < static_cast<int>(cloth.hinges.size()); ++h) visit(hinge_hessian(cloth, law, bent, h, kind));
-    for (const HingeCoupling& coupling : cloth.couplings) visit(coupling_hessian(cloth, law, bent, coupling));
+    const BentHinges bent = bent_hinges(cloth, law, start, x);
+    HingeHessian element;
+    std::size_t coupling = 0;
+    for (int h = 0; h < static_cast<int>(cloth.hinges.size()); ++h) {
+        set_hinge_hessian(cloth, law, bent, h, kind, coupling, element);
+        visit(std::as_const(element));
+    }
 }
 
 }  // namespace diffsim
