@@ -39,11 +39,12 @@ from _common import print_header, print_row, slope
 import diffsim as ds
 
 NODES = (21, 51, 101)  # along a side
-DT, STEPS = 0.01, 40
+DT = 0.01
 SIDE, RADIUS, GAP = 1.0, 0.25, 0.05  # of the sheet, of the sphere, and between them at the start [m]
 YOUNG, THICK, DENSITY, POISSON = 5.0e6, 1.0e-3, 374.0, 0.3  # [Pa], [m], [kg/m³]
 DAMPING = 5.0e-4  # [s]
 HEIGHT = RADIUS + GAP + 0.5 * THICK  # of the sheet over the sphere's centre [m]
+ASIDE = (0.013, 0.007)  # of it: a sheet that falls dead centre stays on the saddles of its buckling [m]
 
 PHASES = ("flight", "contact", "step")
 PEERS = ("mujoco", "vbd")
@@ -79,12 +80,13 @@ def depth_in_sphere(positions: np.ndarray) -> float:
 class Ours:
     """The sheet as a `Simulator`; a first run finds where contact begins and how many iterations steps take."""
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, nodes: int, steps: int) -> None:
+        self.steps = steps
         scene = ds.Scene(gravity=(0.0, 0.0, -9.81))
         scene.add_sphere(RADIUS, density=1000.0, kind="static")
         material = ds.ClothMaterial.isotropic(YOUNG, THICK, DENSITY, POISSON, DAMPING)
         sheet = ds.shapes.sheet(SIDE, nodes)
-        scene.add_cloth(sheet, material, position=(0.0, 0.0, HEIGHT), margin=0.5 * THICK)
+        scene.add_cloth(sheet, material, position=(*ASIDE, HEIGHT), margin=0.5 * THICK)
         self.sim = ds.Simulator(scene, dt=DT, num_threads=1)
         for name in MATERIAL:
             getattr(self.sim, name).requires_grad_()
@@ -94,7 +96,7 @@ class Ours:
         touched = []
         depth = 0.0
         with torch.no_grad():
-            for _ in range(STEPS):
+            for _ in range(steps):
                 states.append(self.sim(states[-1]))
                 info = self.sim.info
                 assert info is not None
@@ -104,7 +106,7 @@ class Ours:
                 depth = max(depth, depth_in_sphere(states[-1].node_position.numpy()))
         self.first = touched.index(True)
         self.starts = {"flight": states[0], "contact": states[self.first]}
-        self.counts = {"flight": self.first, "contact": STEPS - self.first}
+        self.counts = {"flight": self.first, "contact": steps - self.first}
         self.depth = depth
 
     def measure(self, clock: Clock) -> dict[str, Times]:
@@ -129,7 +131,7 @@ class Ours:
         result = {}
         for name, of_phase in seconds.items():
             per_step = [1e3 * of_phase[phase] / self.counts[phase] for phase in self.starts]
-            result[name] = Times(*per_step, 1e3 * sum(of_phase.values()) / STEPS, self.depth)
+            result[name] = Times(*per_step, 1e3 * sum(of_phase.values()) / self.steps, self.depth)
         return result
 
 
@@ -139,7 +141,8 @@ class Ours:
 class Flex:
     """The sheet as a MuJoCo flex."""
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, nodes: int, steps: int) -> None:
+        self.steps = steps
         spacing = SIDE / (nodes - 1)
         # "discrete" integrates the stiffness of flexes implicitly.
         sheet = f'young="{YOUNG}" poisson="{POISSON}" thickness="{THICK}" elastic2d="both" damping="{DAMPING}"'
@@ -147,14 +150,14 @@ class Flex:
             f'<mujoco><size memory="2G"/><option timestep="{DT}" gravity="0 0 -9.81" integrator="discrete"/><worldbody>'
             f'<geom type="sphere" size="{RADIUS}" condim="1"/>'
             f'<flexcomp name="sheet" type="grid" dim="2" count="{nodes} {nodes} 1" spacing="{spacing} {spacing} 1"'
-            f' pos="0 0 {HEIGHT}" radius="{0.5 * THICK}" mass="{DENSITY * THICK * SIDE**2}">'
+            f' pos="{ASIDE[0]} {ASIDE[1]} {HEIGHT}" radius="{0.5 * THICK}" mass="{DENSITY * THICK * SIDE**2}">'
             f'<elasticity {sheet}/><contact selfcollide="auto" condim="1"/></flexcomp></worldbody></mujoco>'
         )
 
     def measure(self, clock: Clock) -> dict[str, Times]:
         data = mujoco.MjData(self.model)
         milliseconds, touched, depth = [], [], 0.0
-        for _ in range(STEPS):
+        for _ in range(self.steps):
             begin = clock()
             mujoco.mj_step(self.model, data)
             milliseconds.append(1e3 * (clock() - begin))
@@ -171,7 +174,8 @@ class Flex:
 class Vbd:
     """The sheet in Newton's VBD solver, its step captured as a graph. Single precision."""
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, nodes: int, steps: int) -> None:
+        self.steps = steps
         import newton
         import warp
 
@@ -181,7 +185,7 @@ class Vbd:
         bend = YOUNG * THICK**3 / (12.0 * (1.0 - POISSON**2))
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, -9.81))
         builder.add_cloth_grid(
-            pos=warp.vec3(-0.5 * SIDE, -0.5 * SIDE, HEIGHT),
+            pos=warp.vec3(ASIDE[0] - 0.5 * SIDE, ASIDE[1] - 0.5 * SIDE, HEIGHT),
             rot=warp.quat_identity(),
             vel=warp.vec3(0.0, 0.0, 0.0),
             dim_x=nodes - 1,
@@ -219,7 +223,7 @@ class Vbd:
     def measure(self, clock: Clock) -> dict[str, Times]:
         self.state.assign(self.start)
         milliseconds, touched, depth = [], [], 0.0
-        for _ in range(STEPS):
+        for _ in range(self.steps):
             begin = clock()
             self.warp.capture_launch(self.graph)
             milliseconds.append(1e3 * (clock() - begin))
@@ -240,7 +244,7 @@ def why_no_newton() -> str | None:
             warp.config.quiet = True
             warp.init()
             warp.set_device("cpu")
-            Vbd(3)
+            Vbd(3, 1)
     except Exception as error:  # whatever keeps it from running must not keep us from it
         return f"newton does not run here: {type(error).__name__}: {error}"
     return None
@@ -285,7 +289,7 @@ class Mesh:
         row: dict[str, float] = {
             "side_nodes": self.nodes,
             "nodes": self.nodes**2,
-            "steps": STEPS,
+            "steps": self.ours.steps,
             "flight_steps": first,
         }
         for name in ("forward", "backward", *PEERS):
@@ -318,6 +322,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nodes", type=int, nargs="+", default=NODES, help="along a side")
     parser.add_argument("--rounds", type=int, default=3, help="of which the medians are printed")
+    parser.add_argument("--steps", type=int, default=40, help="of which the first nine or ten are flight")
     parser.add_argument("--no-peers", action="store_true", help="time diffsim alone")
     parser.add_argument("--cpu-time", action="store_true", help="time on the processor instead of wall time")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw times against nodes")
@@ -336,7 +341,7 @@ def main() -> int:
     print_row(COLUMNS)
     rows = []
     for nodes in options.nodes:
-        mesh = Mesh(nodes, Ours(nodes), [make(nodes) for make in makers])
+        mesh = Mesh(nodes, Ours(nodes, options.steps), [make(nodes, options.steps) for make in makers])
         for _ in range(options.rounds):
             mesh.measure(clock)
         rows.append(mesh.row())
