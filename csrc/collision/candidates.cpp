@@ -34,17 +34,34 @@ Box node_box(const SweptMesh& swept, int node) {
     return swept.tree != nullptr ? swept.tree->nodes[node].box : swept_box_of(swept.mesh->tree.nodes[node].box, swept);
 }
 
-Box edge_box(const SweptMesh& swept, int edge) {
-    Box box = vertex_box(swept, swept.mesh->edges[edge].p0);
-    box.include(vertex_box(swept, swept.mesh->edges[edge].p1));
-    return box;
-}
+/// Boxes around a mesh's swept features. Of a deforming mesh, most of whose vertices are asked for many times, those of
+/// the vertices are made at once.
+class FeatureBoxes {
+public:
+    explicit FeatureBoxes(const SweptMesh& swept) : m_swept(swept) {
+        if (swept.begin == nullptr) return;
+        const int count = static_cast<int>(swept.mesh->vertices.size());
+        m_vertices.reserve(swept.mesh->vertices.size());
+        for (int v = 0; v < count; ++v) m_vertices.push_back(vertex_box(swept, v));
+    }
 
-Box patch_box(const SweptMesh& swept, int patch) {
-    Box box;
-    for (int v : swept.mesh->patches[patch].vertices) box.include(vertex_box(swept, v));
-    return box;
-}
+    const SweptMesh& swept() const { return m_swept; }
+    Box vertex(int v) const { return m_vertices.empty() ? vertex_box(m_swept, v) : m_vertices[v]; }
+    Box edge(int edge) const {
+        Box box = vertex(m_swept.mesh->edges[edge].p0);
+        box.include(vertex(m_swept.mesh->edges[edge].p1));
+        return box;
+    }
+    Box patch(int patch) const {
+        Box box;
+        for (int v : m_swept.mesh->patches[patch].vertices) box.include(vertex(v));
+        return box;
+    }
+
+private:
+    const SweptMesh& m_swept;
+    std::vector<Box> m_vertices;
+};
 
 /// Whether vertices of a cell are to be held against a patch. A sphere's or capsule's patch has no area: the edges
 /// of a mesh cover it, and of two such bodies the vertices of the one with the smaller patch do.
@@ -57,13 +74,13 @@ bool patch_counts(const Patch& own, const Patch& other, ContactType type) {
 
 /// Vertices of one cell against the patch of the other.
 void pair_vertices(
-    const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b, ContactType type,
+    const FeatureBoxes& a, const Cell& cell_a, const FeatureBoxes& b, const Cell& cell_b, ContactType type,
     std::vector<FeaturePair>& pairs) {
     if (cell_a.vertices.empty()) return;
-    if (!patch_counts(a.mesh->patches[cell_a.patch], b.mesh->patches[cell_b.patch], type)) return;
-    const Box box_b = patch_box(b, cell_b.patch);
+    if (!patch_counts(a.swept().mesh->patches[cell_a.patch], b.swept().mesh->patches[cell_b.patch], type)) return;
+    const Box box_b = b.patch(cell_b.patch);
     for (int v : cell_a.vertices) {
-        if (!vertex_box(a, v).overlaps(box_b)) continue;
+        if (!a.vertex(v).overlaps(box_b)) continue;
         if (type == ContactType::vertex_patch)
             pairs.push_back({type, v, cell_b.patch});
         else
@@ -72,13 +89,14 @@ void pair_vertices(
 }
 
 void pair_cells(
-    const SweptMesh& a, const Cell& cell_a, const SweptMesh& b, const Cell& cell_b, std::vector<FeaturePair>& pairs) {
+    const FeatureBoxes& a, const Cell& cell_a, const FeatureBoxes& b, const Cell& cell_b,
+    std::vector<FeaturePair>& pairs) {
     pair_vertices(a, cell_a, b, cell_b, ContactType::vertex_patch, pairs);
     pair_vertices(b, cell_b, a, cell_a, ContactType::patch_vertex, pairs);
     for (int ea : cell_a.edges) {
-        const Box box_a = edge_box(a, ea);
+        const Box box_a = a.edge(ea);
         for (int eb : cell_b.edges)
-            if (box_a.overlaps(edge_box(b, eb))) pairs.push_back({ContactType::edge_edge, ea, eb});
+            if (box_a.overlaps(b.edge(eb))) pairs.push_back({ContactType::edge_edge, ea, eb});
     }
 }
 
@@ -215,14 +233,104 @@ struct CrossingCheck {
     }
 };
 
+/// The corners of a feature at both ends of its mesh's motion; of a patch also its normal where the motion begins.
+struct PlacedFeature {
+    std::vector<Vec3> begin, end;
+    Vec3 normal = Vec3::Zero();
+
+    void clear() {
+        begin.clear();
+        end.clear();
+    }
+    void add(const SweptMesh& swept, int vertex) {
+        if (swept.begin != nullptr) {
+            begin.push_back(swept.begin[vertex]);
+            end.push_back(swept.end[vertex]);
+        } else {
+            begin.push_back(swept.sweep.begin * swept.mesh->vertices[vertex]);
+            end.push_back(swept.sweep.end * swept.mesh->vertices[vertex]);
+        }
+    }
+    void place_vertex(const SweptMesh& swept, int vertex) {
+        clear();
+        add(swept, vertex);
+    }
+    void place_edge(const SweptMesh& swept, int edge) {
+        clear();
+        add(swept, swept.mesh->edges[edge].p0);
+        add(swept, swept.mesh->edges[edge].p1);
+    }
+    void place_patch(const SweptMesh& swept, int patch) {
+        clear();
+        for (int v : swept.mesh->patches[patch].vertices) add(swept, v);
+        normal = polygon_normal(begin.data(), static_cast<int>(begin.size()));
+    }
+    PolygonView polygon() const { return {begin.data(), static_cast<int>(begin.size()), normal}; }
+    double least_move(const Vec3& direction) const {
+        double least = kInfinity;
+        for (std::size_t k = 0; k < begin.size(); ++k) least = std::min(least, direction.dot(end[k] - begin[k]));
+        return least;
+    }
+};
+
+/// Whether two features stay further apart than both meshes reach. The plane through their closest points where the
+/// motion begins, normal to their offset, is between them; they come no nearer than by what they move towards it.
+class ApartTest {
+public:
+    ApartTest(const SweptMesh& a, const SweptMesh& b) : m_a(a), m_b(b) {}
+
+    bool operator()(const FeaturePair& pair) {
+        const ClosestPoints points = closest(pair);
+        const Vec3 offset = points.point_a - points.point_b;
+        const double distance = offset.norm();
+        if (!(distance > m_a.reach + m_b.reach)) return false;
+        const Vec3 normal = offset / distance;
+        const double opening = m_feature_a.least_move(normal) + m_feature_b.least_move(-normal);
+        return distance + std::min(opening, 0.0) > m_a.reach + m_b.reach;
+    }
+
+private:
+    ClosestPoints closest(const FeaturePair& pair) {
+        switch (pair.type) {
+            case ContactType::vertex_patch:
+                m_feature_a.place_vertex(m_a, pair.feature_a);
+                m_feature_b.place_patch(m_b, pair.feature_b);
+                return closest_vertex_polygon(m_feature_a.begin[0], m_feature_b.polygon());
+            case ContactType::patch_vertex: {
+                m_feature_a.place_patch(m_a, pair.feature_a);
+                m_feature_b.place_vertex(m_b, pair.feature_b);
+                ClosestPoints points = closest_vertex_polygon(m_feature_b.begin[0], m_feature_a.polygon());
+                std::swap(points.point_a, points.point_b);
+                return points;
+            }
+            case ContactType::edge_edge:
+                break;
+        }
+        m_feature_a.place_edge(m_a, pair.feature_a);
+        m_feature_b.place_edge(m_b, pair.feature_b);
+        return closest_edge_edge(
+            m_feature_a.begin[0], m_feature_a.begin[1], m_feature_b.begin[0], m_feature_b.begin[1]);
+    }
+
+    const SweptMesh &m_a, &m_b;
+    PlacedFeature m_feature_a, m_feature_b;  // of which the memory is reused
+};
+
 }  // namespace
+
+void drop_distant_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs) {
+    ApartTest apart(a, b);
+    pairs.erase(
+        std::remove_if(pairs.begin(), pairs.end(), [&](const FeaturePair& p) { return apart(p); }), pairs.end());
+}
 
 BoxTree refitted_tree(const SweptMesh& swept) {
     BoxTree tree = swept.mesh->tree;
+    const FeatureBoxes boxes(swept);
     for (std::size_t k = tree.nodes.size(); k-- > 0;) {  // children follow their parents
         BoxTree::Node& node = tree.nodes[k];
         if (node.is_leaf()) {
-            node.box = patch_box(swept, swept.mesh->cells[node.item].patch);
+            node.box = boxes.patch(swept.mesh->cells[node.item].patch);
         } else {
             node.box = tree.nodes[node.left].box;
             node.box.include(tree.nodes[node.right].box);
@@ -234,13 +342,16 @@ BoxTree refitted_tree(const SweptMesh& swept) {
 Box swept_box(const SweptMesh& swept) { return node_box(swept, 0); }
 
 void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs) {
-    for_each_cell_pair(a, b, [&](const Cell& cell_a, const Cell& cell_b) { pair_cells(a, cell_a, b, cell_b, pairs); });
+    const FeatureBoxes boxes_a(a), boxes_b(b);
+    for_each_cell_pair(
+        a, b, [&](const Cell& cell_a, const Cell& cell_b) { pair_cells(boxes_a, cell_a, boxes_b, cell_b, pairs); });
 }
 
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs) {
+    const FeatureBoxes boxes(swept);
     for_each_own_cell_pair(swept, [&](const Cell& cell_a, const Cell& cell_b) {
         const auto first = static_cast<std::ptrdiff_t>(pairs.size());
-        pair_cells(swept, cell_a, swept, cell_b, pairs);
+        pair_cells(boxes, cell_a, boxes, cell_b, pairs);
         const auto share = [&](const FeaturePair& pair) { return share_vertex(*swept.mesh, pair); };
         pairs.erase(std::remove_if(pairs.begin() + first, pairs.end(), share), pairs.end());
     });

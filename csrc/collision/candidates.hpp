@@ -45,6 +45,10 @@ void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<F
 /// The same within one deforming mesh; features that share a vertex do not count.
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs);
 
+/// Remove the pairs that stay further apart than the sum of both reaches although their boxes overlap: in a mesh of
+/// triangles that is most neighbours. Costs a distance per pair. Of one mesh with itself: give it twice.
+void drop_distant_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
+
 /// Whether the surfaces of two meshes go through each other where their motions begin: a side of a patch of one through a
 /// patch of the other. One mesh wholly inside another does not count, nor do points, nor two segments.
 bool meshes_cross(const SweptMesh& a, const SweptMesh& b);

@@ -220,6 +220,7 @@ private:
             if (!yields(i) && !yields(j)) continue;
             m_features.clear();
             collect_feature_pairs(m_meshes[i], m_meshes[j], m_features);
+            if (j >= m_zone.body_count()) drop_distant_pairs(m_meshes[i], m_meshes[j], m_features);
             if (m_features.empty()) continue;
             const std::size_t first = m_zone.contacts.size();
             for (const FeaturePair& f : m_features)
@@ -238,7 +239,9 @@ private:
         const double reach = model.margin + m_coverage.cloth_slack[c];
         const SweptCloth swept = sweep_cloth(m_zone, c, m_begin, m_end, mean, reach);
         m_features.clear();
-        collect_self_pairs(swept.mesh(model, reach), m_features);
+        const SweptMesh mesh = swept.mesh(model, reach);
+        collect_self_pairs(mesh, m_features);
+        drop_distant_pairs(mesh, mesh, m_features);
         const int object_id = m_zone.model->body_count() + m_zone.cloths[c].id;
         for (const FeaturePair& f : m_features)
             add_contact(m_zone, {object_id, object_id, f.type, f.feature_a, f.feature_b}, {kNobody, c}, {kNobody, c});

@@ -162,6 +162,49 @@ TEST(no_pair_nearer_than_the_reach_is_missing_or_listed_twice) {
     CHECK(quiet >= 3);  // "all pairs, always" would be complete too
 }
 
+TEST(pairs_dropped_as_distant_do_not_come_near) {
+    const CollisionMesh box = fixtures::collision_mesh(fixtures::box(Vec3(0.3, 0.2, 0.25)));
+    const Cloth cloth = fixtures::cloth(fixtures::grid(9, 3, 0.15));
+    check::Random random(12);
+    std::size_t near = 0, dropped = 0;
+    for (int k = 0; k < 30; ++k) {
+        NOTE(k);
+        DeformingSweep sheet = random_sheet(cloth, random, k % 3 == 0 ? 0.0 : 0.3, 0.02);
+        const SweptMesh swept = sheet.swept();
+        const auto drop = [&](const SweptMesh& other, std::vector<FeaturePair> pairs) {
+            const std::size_t all = pairs.size();
+            drop_distant_pairs(other, swept, pairs);
+            dropped += all - pairs.size();
+            return pairs;
+        };
+        std::vector<FeaturePair> pairs;
+        collect_self_pairs(swept, pairs);
+        const std::set<Key> own = self_keys(drop(swept, pairs)), own_near = near_self_pairs(swept, 0.04);
+        CHECK(std::includes(own.begin(), own.end(), own_near.begin(), own_near.end()));
+
+        const SweptMesh rigid{&box, random_sweep(random, 0.3, k % 2 == 0 ? 0.0 : 0.6), 0.05};
+        pairs.clear();
+        collect_feature_pairs(rigid, swept, pairs);
+        const std::set<Key> others = keys(drop(rigid, pairs)), others_near = near_pairs(rigid, swept, 0.07);
+        CHECK(std::includes(others.begin(), others.end(), others_near.begin(), others_near.end()));
+        near += own_near.size() + others_near.size();
+    }
+    CHECK(near >= 500);
+    CHECK(dropped >= 500);
+}
+
+TEST(only_what_moves_towards_each_other_is_near_in_a_flat_sheet) {
+    const Cloth cloth = fixtures::cloth(fixtures::grid(9, 3, 0.15));
+    DeformingSweep sheet{
+        &cloth.surface, cloth.rest, fixtures::moved(cloth.rest, Mat3::Identity(), Vec3(0, 0, -1)), 0.02};
+    const SweptMesh swept = sheet.swept();
+    std::vector<FeaturePair> pairs;
+    collect_self_pairs(swept, pairs);
+    CHECK(pairs.size() >= 50);
+    drop_distant_pairs(swept, swept, pairs);
+    CHECK(pairs.empty());
+}
+
 TEST(no_pair_of_a_deforming_mesh_is_missing_or_listed_twice) {
     const CollisionMesh box = fixtures::collision_mesh(fixtures::box(Vec3(0.3, 0.2, 0.25)));
     const Cloth first = fixtures::cloth(fixtures::grid(9, 3, 0.15)), second = fixtures::cloth(fixtures::hexagon(0.4));
