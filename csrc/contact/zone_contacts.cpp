@@ -8,6 +8,8 @@
 namespace diffsim {
 namespace {
 
+constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
+
 /// Bound on how far any vertex moves when the coordinates change by this much.
 double motion_bound(const Vec6& change, double radius) {
     return change.tail<3>().norm() + std::min(change.head<3>().norm(), 2.0) * radius;
@@ -43,6 +45,15 @@ Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, co
     Vec3 sum = Vec3::Zero();
     for (int i = cloth.first_node; i < cloth.first_node + count; ++i) sum += end.nodes[i] - begin.nodes[i];
     return sum / count;
+}
+
+/// Largest motion of a cloth's node relative to their mean.
+double uneven_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end) {
+    const Vec3 mean = mean_motion(cloth, count, begin, end);
+    double uneven_sq = 0.0;
+    for (int i = cloth.first_node; i < cloth.first_node + count; ++i)
+        uneven_sq = std::max(uneven_sq, (end.nodes[i] - begin.nodes[i] - mean).squaredNorm());
+    return std::sqrt(uneven_sq);
 }
 
 SweptCloth sweep_cloth(
@@ -195,11 +206,13 @@ private:
     SweptMesh add_cloth(int c) {
         const ZoneCloth& cloth = m_zone.cloths[c];
         const Cloth& model = m_zone.cloth(c);
-        const Vec3 mean = mean_motion(cloth, model.node_count(), m_begin, m_end);
-        double uneven_sq = 0.0;
-        for (int i = cloth.first_node; i < cloth.first_node + model.node_count(); ++i)
-            uneven_sq = std::max(uneven_sq, (m_end.nodes[i] - m_begin.nodes[i] - mean).squaredNorm());
-        const double slack = 0.5 * m_zone.model->thickness + 0.25 * std::sqrt(uneven_sq);
+        // Late iterations are short, but they may turn: room in proportion to the step's whole motion, too.
+        Coordinates start;
+        start.assign_zero(0, m_zone.nodes.size());
+        const double uneven = std::max(
+            uneven_motion(cloth, model.node_count(), m_begin, m_end),
+            kWholeMotion * uneven_motion(cloth, model.node_count(), start, m_end));
+        const double slack = 0.5 * m_zone.model->thickness + 0.25 * uneven;
         m_coverage.cloth_slack.push_back(slack);
         m_cloths.push_back(sweep_cloth(m_zone, c, m_begin, m_end, Vec3::Zero(), model.margin + slack));
         return m_cloths.back().mesh(model, model.margin + slack);
