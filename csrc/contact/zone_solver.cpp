@@ -226,11 +226,13 @@ private:
 
     /// The Newton step, from the exact Hessian where that is positive definite. False if rounding spoils even the other.
     bool newton_step() {
+        m_factor_is_exact = false;
         if (m_exact_in > 0) {
             --m_exact_in;
         } else {
             differentiate_here(Curvature::exact);
-            if (m_w.system.factorize()) return solve_for_step();
+            m_factor_is_exact = m_w.system.factorize();
+            if (m_factor_is_exact) return solve_for_step();
             if (!m_zone.nodes.empty()) m_exact_in = kStepsBeforeExact;
         }
         differentiate_here(Curvature::projected);
@@ -310,6 +312,29 @@ private:
         return false;
     }
 
+    /// Whether the gradient alone says that a cloth's Newton step reached the minimum. If so, takes the step past the
+    /// tolerance with the factor at hand: the next one would only show the same.
+    bool finish_with_this_factor() {
+        if (m_zone.nodes.empty() || !m_zone.elastic || !m_factor_is_exact) return false;
+        const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
+        differentiate_here(Curvature::none);
+        m_w.derivatives.largest_stiffness = stiffness;
+        const Accuracy now = accuracy();
+        if (!(now.residual < std::max(m_options.tolerance, now.floor)) || !solve_for_step()) return false;
+        set_step_end();
+        m_result.residual = now.residual;
+        polish();
+        return true;
+    }
+
+    /// Where the Newton step ends.
+    void set_step_end() {
+        m_w.y_end = y();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] += m_w.step.bodies[i];
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] += m_w.step.nodes[i];
+    }
+
     void iterate() {
         int stalls = 0;
         int relaxations = 0;  // Newton steps to be taken before driven bodies go on
@@ -320,10 +345,7 @@ private:
             if (!newton_step()) return fail(ZoneStatus::no_descent);
             const Accuracy now = accuracy();
             m_result.residual = now.residual;
-            m_w.y_end = y();
-            for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] += m_w.step.bodies[i];
-            for (int i = 0; i < m_zone.node_count(); ++i)
-                if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] += m_w.step.nodes[i];
+            set_step_end();
             const double rounding_step = 16.0 * kEpsilon * m_position;
             if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
                 polish();
@@ -351,6 +373,11 @@ private:
             step = driven && step < kClampedStep ? past_impacts(step, true) : arc_step(step);
             if (line_search(step)) {
                 accept_trial();
+                const bool is_last = m_result.iterations + 1 >= m_options.max_iterations;
+                if (driven && !is_last && finish_with_this_factor()) {
+                    ++m_result.iterations;
+                    return;
+                }
             } else if (!driven) {
                 relaxations = 0;
             } else {
@@ -379,6 +406,7 @@ private:
 
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
     double past_impacts(double newton_limit, bool driven) {
+        m_factor_is_exact = false;  // the QP factorizes its own matrix
         Coordinates target = y();
         set_to_targets(target);
         ensure_covered(target);
@@ -468,9 +496,10 @@ private:
     std::vector<Box>& m_visited;
     ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
-    double m_position = 0.0;  // size of the numbers that distances are differences of [m]
-    int m_exact_in = 0;       // Newton steps until the exact Hessian is tried again
-    bool m_rescue = false;    // some objects start the step below their floor
+    double m_position = 0.0;         // size of the numbers that distances are differences of [m]
+    int m_exact_in = 0;              // Newton steps until the exact Hessian is tried again
+    bool m_factor_is_exact = false;  // the system's, of the exact Hessian
+    bool m_rescue = false;           // some objects start the step below their floor
     ZoneResult m_result;
 };
 
