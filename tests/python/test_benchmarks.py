@@ -17,6 +17,7 @@ SCRIPTS = sorted(BENCHMARKS.glob("[a-z]*.py"))
 COLUMNS = {
     "adjoint_modes": ("scene", "qr_state", "exact_error_median", "dense_backward_ms"),
     "batch": ("case", "scenes", "loop_forward_per_s", "gradient_ratio"),
+    "cloth": ("side_nodes", "forward_contact_ms", "mujoco_step_ms", "backward_to_forward", "vbd_depth_m"),
     "falling_cubes": ("cubes", "forward_s", "mujoco_elliptic_s", "memory_mb", "rest_gap_m"),
     "fast_differentiation": ("cubes", "mode", "backward_ms", "memory_mb", "error", "backward_to_mujoco"),
     "local_collisions": ("cubes", "step", "mode", "local_ms", "global_ms", "lcp_published_ms", "paper_code_ms"),
@@ -66,7 +67,7 @@ def test_benchmark_prints_its_table(script: Path, tmp_path: Path) -> None:
             assert math.isfinite(value), (name, text)
             assert value > 0.0 if name.endswith(POSITIVE) else value >= 0.0, (name, text)
     filled = {name for row in rows for name, text in row.items() if text}
-    peers = {name for name in columns if "published" in name or "paper" in name or "mpm" in name}
+    peers = {name for name in columns if any(peer in name for peer in ("published", "paper", "mpm", "vbd"))}
     assert filled >= set(columns) - peers  # only others' figures may be missing everywhere, as quick runs are small
     for comment in comments:
         if comment.startswith("# plot: "):
