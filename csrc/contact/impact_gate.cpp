@@ -50,21 +50,24 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
         if (travel <= passing) continue;
         const Vec6 y_a = point.y.bodies[a] + impact.toi * (y_end.bodies[a] - point.y.bodies[a]);
         const Vec6 y_b = point.y.bodies[b] + impact.toi * (y_end.bodies[b] - point.y.bodies[b]);
-        const ContactGeometry geometry = contact_geometry(
-            *zone.model, contact.contact, pose_at(zone.bodies[a], y_a), pose_at(zone.bodies[b], y_b),
-            zone.ground_height);
+        const Pose pose_a = pose_at(zone.bodies[a], y_a), pose_b = pose_at(zone.bodies[b], y_b);
+        const ContactGeometry geometry =
+            contact_geometry(*zone.model, contact.contact, pose_a, pose_b, zone.ground_height);
         gates.push_back(
             {a, b, in_body(zone, a, y_a, geometry.closest.point_a), in_body(zone, b, y_b, geometry.closest.point_b),
-             geometry.normal, contact.range.rest, passing, travel > kFastPart * radius});
+             geometry.normal, contact.range.rest, geometry.normal.dot(pose_a.t - pose_b.t), passing,
+             travel > kFastPart * radius});
     }
     return gates;
 }
 
 bool gates_hold(const std::vector<ImpactGate>& gates, const Zone& zone, const Coordinates& y) {
     return std::all_of(gates.begin(), gates.end(), [&](const ImpactGate& gate) {
-        const Vec3 x_a = pose_at(zone.bodies[gate.a], y.bodies[gate.a]) * gate.point_a;
-        const Vec3 x_b = pose_at(zone.bodies[gate.b], y.bodies[gate.b]) * gate.point_b;
-        return gate.normal.dot(x_a - x_b) - gate.rest >= -gate.allowed_passing;
+        const Pose a = pose_at(zone.bodies[gate.a], y.bodies[gate.a]),
+                   b = pose_at(zone.bodies[gate.b], y.bodies[gate.b]);
+        const double points = gate.normal.dot(a * gate.point_a - b * gate.point_b) - gate.rest;
+        const double centers = gate.normal.dot(a.t - b.t) - gate.centers;
+        return points >= -gate.allowed_passing && centers >= -2.0 * gate.allowed_passing;
     });
 }
 

@@ -16,7 +16,8 @@ struct ImpactGate {
     Vec3 point_a, point_b;   ///< that meet, body frames
     Vec3 normal;             ///< from b to a, zone frame
     double rest;             ///< distance along it at which their surfaces touch [m]
-    double allowed_passing;  ///< [m]
+    double centers;          ///< distance of the centres of mass along it at the impact [m]
+    double allowed_passing;  ///< of the points; of the centres, past which bodies turn as well, twice that [m]
     bool fast;               ///< they would move against each other by three quarters of the smaller's size or more
 };
 
