@@ -7,6 +7,7 @@
 #include <numeric>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 #include "math/rotation.hpp"
 
@@ -25,27 +26,6 @@ double seconds_since(Clock::time_point& last) {
     last = now;
     return seconds;
 }
-
-/// Disjoint sets; the root of a set is its smallest member, so that numbering does not depend on the order of unions.
-class UnionFind {
-public:
-    void reset(int count) {
-        m_parent.resize(static_cast<std::size_t>(count));
-        std::iota(m_parent.begin(), m_parent.end(), 0);
-    }
-    int find(int i) {
-        while (m_parent[i] != i) i = m_parent[i] = m_parent[m_parent[i]];
-        return i;
-    }
-    void unite(int i, int j) {
-        i = find(i);
-        j = find(j);
-        m_parent[std::max(i, j)] = std::min(i, j);
-    }
-
-private:
-    std::vector<int> m_parent;
-};
 
 std::uint64_t mix(std::uint64_t hash, std::uint64_t value) {
     hash ^= value + 0x9e3779b97f4a7c15ull + (hash << 6) + (hash >> 2);
@@ -106,8 +86,7 @@ struct StepWorkspace::ForwardScratch {
     std::vector<GroupOutcome> outcomes;
     std::vector<Box> swept, visited;  ///< world frame, margins included; visited space of objects that were in a zone
     std::vector<char> dirty;          ///< groups to be solved, at their smallest object
-    std::vector<int> zone_of;
-    UnionFind groups, touching;
+    UnionFind groups;
 
     Coordinates y;
     std::vector<Vec3> elastic_shift;  ///< with split coupling: each node's motion without contact
@@ -119,9 +98,9 @@ struct StepWorkspace::ForwardScratch {
     std::vector<Group> to_solve;
     std::vector<GroupResults> results;  ///< one per thread
     std::vector<BlockedDrive> blocked;
-    std::vector<int> zone_bodies, zone_body_end, zone_cloths, zone_cloth_end, zone_contact_end;  ///< as in StepRecord
-    std::vector<Contact> zone_contacts;
-    std::vector<double> zone_shifts;
+    std::vector<ContactList> contact_lists;  ///< of the groups, by their smallest objects
+    ZoneFinder zone_finder;
+    TouchingZones zones;
 };
 
 namespace {
@@ -493,82 +472,27 @@ private:
 
     // --- results -----------------------------------------------------------------------------------------------
 
-    /// Zones of objects that really touch, and of every cloth: what the backward solves together. Or one of all movers.
+    /// What touches now, group after group, as zones.
     void find_zones() {
-        const int count = object_count();
-        const auto yields = [&](int object) {
-            return object >= 0 && (m_model.is_cloth(object) || body(object).is_dynamic());
-        };
-        m.touching.reset(count);
-        m.zone_of.assign(static_cast<std::size_t>(count), -1);
-        for (int c = m_model.body_count(); c < count; ++c) m.zone_of[c] = 0;
-        if (m_options.global_zone) {
-            for (int i : m.movers) {
-                m.zone_of[i] = 0;
-                m.touching.unite(m.movers[0], i);
-            }
+        m.contact_lists.clear();
+        for (int root : m.movers) {
+            const GroupOutcome& outcome = m.outcomes[root];
+            const GroupResults& results = m.results[outcome.thread];
+            const int first = outcome.first_contact;
+            m.contact_lists.push_back(
+                {results.contacts.data() + first, results.shifts.data() + first, outcome.contact_end - first});
         }
-        const auto for_each_contact = [&](const auto& visit) {
-            for (int root : m.movers) {
-                const GroupOutcome& outcome = m.outcomes[root];
-                const GroupResults& results = m.results[outcome.thread];
-                for (int k = outcome.first_contact; k < outcome.contact_end; ++k)
-                    visit(results.contacts[k], results.shifts[k]);
-            }
-        };
-        m_info.contacts = 0;
-        for_each_contact([&](const Contact& c, double) {
-            ++m_info.contacts;
-            if (yields(c.object_a)) m.zone_of[c.object_a] = 0;
-            if (yields(c.object_b)) m.zone_of[c.object_b] = 0;
-            if (yields(c.object_a) && yields(c.object_b)) m.touching.unite(c.object_a, c.object_b);
-        });
-        // Number the zones by their smallest objects, then sort objects and contacts by zone.
-        m.zone_body_end.clear();
-        m.zone_cloth_end.clear();
-        for (int i : m.movers) {
-            if (m.zone_of[i] < 0) continue;
-            const int root = m.touching.find(i);
-            if (root == i) {
-                m.zone_of[i] = static_cast<int>(m.zone_body_end.size());
-                m.zone_body_end.push_back(0);
-                m.zone_cloth_end.push_back(0);
-            } else {
-                m.zone_of[i] = m.zone_of[root];
-            }
-            ++(m_model.is_cloth(i) ? m.zone_cloth_end : m.zone_body_end)[m.zone_of[i]];
+        m.zone_finder.find(
+            m_model, m.movers, m.contact_lists, m_options.compliance == 0.0, m_options.global_zone, m.zones);
+        m_info.contacts = static_cast<int>(m.zones.contacts.size());
+        int body = 0, cloth = 0, contact = 0;
+        for (int z = 0; z < m.zones.count(); ++z) {
+            const int body_count = m.zones.body_end[z] - std::exchange(body, m.zones.body_end[z]);
+            const int cloth_count = m.zones.cloth_end[z] - std::exchange(cloth, m.zones.cloth_end[z]);
+            if (std::exchange(contact, m.zones.contact_end[z]) == m.zones.contact_end[z]) continue;
+            ++m_info.zones;
+            m_info.largest_zone = std::max(m_info.largest_zone, body_count + cloth_count);
         }
-        m.zone_contact_end.assign(m.zone_body_end.size(), 0);
-        const auto zone_of_contact = [&](const Contact& c) {
-            return m.zone_of[yields(c.object_a) ? c.object_a : c.object_b];
-        };
-        for_each_contact([&](const Contact& c, double) { ++m.zone_contact_end[zone_of_contact(c)]; });
-        int bodies = 0, cloths = 0, contacts = 0;
-        for (std::size_t z = 0; z < m.zone_body_end.size(); ++z) {
-            if (m.zone_contact_end[z] > 0) {
-                ++m_info.zones;
-                m_info.largest_zone = std::max(m_info.largest_zone, m.zone_body_end[z] + m.zone_cloth_end[z]);
-            }
-            bodies += std::exchange(m.zone_body_end[z], bodies);
-            cloths += std::exchange(m.zone_cloth_end[z], cloths);
-            contacts += std::exchange(m.zone_contact_end[z], contacts);
-        }
-        m.zone_bodies.resize(static_cast<std::size_t>(bodies));
-        m.zone_cloths.resize(static_cast<std::size_t>(cloths));
-        m.zone_contacts.resize(static_cast<std::size_t>(contacts));
-        for (int i : m.movers) {
-            if (m.zone_of[i] < 0) continue;
-            if (m_model.is_cloth(i))
-                m.zone_cloths[m.zone_cloth_end[m.zone_of[i]]++] = i - m_model.body_count();
-            else
-                m.zone_bodies[m.zone_body_end[m.zone_of[i]]++] = i;
-        }
-        m.zone_shifts.resize(m.zone_contacts.size());
-        for_each_contact([&](const Contact& c, double shift) {
-            const int slot = m.zone_contact_end[zone_of_contact(c)]++;
-            m.zone_contacts[slot] = c;
-            m.zone_shifts[slot] = shift;
-        });
     }
 
     SceneState finish() {
@@ -630,14 +554,8 @@ private:
         record.start = m_state;
         record.free_rotation = m.rotation;
         record.y = m.y;
-        record.zone_bodies = m.zone_bodies;
-        record.zone_body_end = m.zone_body_end;
-        record.zone_cloths = m.zone_cloths;
-        record.zone_cloth_end = m.zone_cloth_end;
+        record.zones = m.zones;
         if (m_options.split) record.elastic_shift = m.elastic_shift;
-        record.zone_contact_end = m.zone_contact_end;
-        record.contacts = m.zone_contacts;
-        if (m_options.compliance == 0.0) record.shifts = m.zone_shifts;
     }
 
     const Model& m_model;
@@ -666,10 +584,7 @@ std::size_t StepRecord::bytes() const {
            (start.node_position.capacity() + start.node_velocity.capacity() + y.nodes.capacity() +
             elastic_shift.capacity()) *
                sizeof(Vec3) +
-           contacts.capacity() * sizeof(Contact) + shifts.capacity() * sizeof(double) +
-           (zone_bodies.capacity() + zone_body_end.capacity() + zone_cloths.capacity() + zone_cloth_end.capacity() +
-            zone_contact_end.capacity()) *
-               sizeof(int);
+           zones.bytes();
 }
 
 ZoneBody moving_body(

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "contact/adjoint.hpp"
+#include "contact/touching_zones.hpp"
 #include "contact/zone_solver.hpp"
 #include "dynamics/free_motion.hpp"
 #include "model/state.hpp"
@@ -21,10 +22,7 @@ struct StepRecord {
     std::vector<FreeRotation> free_rotation;  ///< one per body
     Coordinates y;                            ///< the motion of the step: (turn, shift) per body, shift per node
     std::vector<Vec3> elastic_shift;          ///< per node: its motion without contact; with split coupling only
-    /// Dynamic bodies in contact and all cloths, zone after zone, and the active contacts of each zone.
-    std::vector<int> zone_bodies, zone_body_end, zone_cloths, zone_cloth_end, zone_contact_end;
-    std::vector<Contact> contacts;
-    std::vector<double> shifts;  ///< of hard contacts' rest distances; empty when contacts give way
+    TouchingZones zones;
 
     std::size_t bytes() const;
 };

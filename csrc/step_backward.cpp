@@ -69,7 +69,7 @@ public:
         m.pose_gradient.assign(count, Vec6::Zero());
         m.multiplier.assign(count, Vec6::Zero());
         m.in_zone.assign(count, 0);
-        for (int i : m_record.zone_bodies) m.in_zone[i] = 1;
+        for (int i : m_record.zones.bodies) m.in_zone[i] = 1;
         solve_zones();
         m_workspace.workers.for_each_range(static_cast<int>(count), kBodiesARange, [&](int begin, int end, int) {
             for (int i = begin; i < end; ++i) finish_body(i);
@@ -92,12 +92,12 @@ private:
 
     void solve_zones() {
         m.zone_first.assign(1, ZoneRange{});
-        for (std::size_t k = 0; k < m_record.zone_body_end.size(); ++k)
+        for (std::size_t k = 0; k < m_record.zones.body_end.size(); ++k)
             m.zone_first.push_back(
-                {m_record.zone_body_end[k], m_record.zone_cloth_end[k], m_record.zone_contact_end[k]});
+                {m_record.zones.body_end[k], m_record.zones.cloth_end[k], m_record.zones.contact_end[k]});
         // Threads write to the zones' own bodies and cloths. What zones share is added up after, in the zones' order.
         const int count = static_cast<int>(m.zone_first.size()) - 1;
-        const bool worth_it = !m_record.zone_cloths.empty() || m_record.zone_bodies.size() >= kWorthSharing;
+        const bool worth_it = !m_record.zones.cloths.empty() || m_record.zones.bodies.size() >= kWorthSharing;
         const int portions = worth_it ? kPortionsPerThread * m_workspace.workers.thread_count() : 1;
         m_workspace.workers.for_each_range(count, std::max(count / portions, 1), [&](int begin, int end, int thread) {
             for (int k = begin; k < end; ++k) solve_zone_adjoint(k, thread);
@@ -149,13 +149,13 @@ private:
         zone.elastic = !m_options.split;
         zone.contacts_off = false;
         zone.origin = first.body < end.body
-                          ? m_record.start.bodies[m_record.zone_bodies[first.body]].position
-                          : m_record.start.node_position[m_model.cloths[m_record.zone_cloths[first.cloth]].first_node];
+                          ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
+                          : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
         zone.ground_height = m_model.ground.height - zone.origin.z();
         memory.workspace.point.y.resize(0, 0);
-        for (int b = first.body; b < end.body; ++b) join_body(memory, lane, m_record.zone_bodies[b]);
+        for (int b = first.body; b < end.body; ++b) join_body(memory, lane, m_record.zones.bodies[b]);
         zone.dynamic_count = end.body - first.body;
-        for (int c = first.cloth; c < end.cloth; ++c) join_cloth(memory, lane, m_record.zone_cloths[c]);
+        for (int c = first.cloth; c < end.cloth; ++c) join_cloth(memory, lane, m_record.zones.cloths[c]);
     }
 
     void join_body(ZoneMemory& memory, BackwardLane& lane, int id) const {
@@ -187,7 +187,7 @@ private:
     void list_contacts(const ZoneRange& first, const ZoneRange& end, ZoneMemory& memory, BackwardLane& lane) const {
         Zone& zone = memory.zone;
         for (int c = first.contact; c < end.contact; ++c) {
-            const Contact& contact = m_record.contacts[c];
+            const Contact& contact = m_record.zones.contacts[c];
             for (int object : {contact.object_a, contact.object_b})
                 if (object >= 0 && lane.local[object] < 0) join_body(memory, lane, object);  // one that does not yield
         }
@@ -197,11 +197,11 @@ private:
                                             : ZoneObject{lane.local[object], -1};
         };
         for (int c = first.contact; c < end.contact; ++c) {
-            const Contact& contact = m_record.contacts[c];
+            const Contact& contact = m_record.zones.contacts[c];
             add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
             ZoneContact& entry = zone.contacts.back();
             if (zone.hard) {
-                entry.shift = m_record.shifts[c];
+                entry.shift = m_record.zones.shifts[c];
                 entry.range.rest += entry.shift;
             }
             if (zone.yields(entry.a) && zone.yields(entry.b))
@@ -235,7 +235,7 @@ private:
             evaluate(zone, point);
         }
         lane.upstream.resize(0, 0);
-        for (int b = first.body; b < end.body; ++b) lane.upstream.bodies.push_back(upstream(m_record.zone_bodies[b]));
+        for (int b = first.body; b < end.body; ++b) lane.upstream.bodies.push_back(upstream(m_record.zones.bodies[b]));
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 lane.upstream.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));

@@ -1,0 +1,44 @@
+#pragma once
+
+#include <vector>
+
+#include "contact/contact.hpp"
+#include "math/union_find.hpp"
+#include "model/model.hpp"
+
+/// Zones as a step leaves them: of what really touches, where before there were groups of what might meet.
+namespace diffsim {
+
+/// Dynamic bodies in contact and all cloths, zone after zone, and the active contacts of each zone: what the backward
+/// solves together. Zones are in the order of their smallest objects, bodies before cloths.
+struct TouchingZones {
+    std::vector<int> bodies, cloths;
+    std::vector<Contact> contacts;
+    std::vector<double> shifts;  ///< of hard contacts' rest distances; empty when contacts give way
+    std::vector<int> body_end, cloth_end, contact_end;  ///< of each zone in the lists above
+
+    int count() const { return static_cast<int>(body_end.size()); }
+    std::size_t bytes() const;
+};
+
+/// Active contacts of one group.
+struct ContactList {
+    const Contact* contacts;
+    const double* shifts;
+    int count;
+};
+
+/// Makes zones from contacts; keeps its memory.
+class ZoneFinder {
+public:
+    /// `movers` are the dynamic bodies and the cloths, sorted. `one_zone` puts them all into one.
+    void find(
+        const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_shifts,
+        bool one_zone, TouchingZones& zones);
+
+private:
+    UnionFind m_touching;
+    std::vector<int> m_zone_of;  // per object, -1 in none
+};
+
+}  // namespace diffsim
