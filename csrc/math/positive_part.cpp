@@ -1,5 +1,8 @@
 #include "math/positive_part.hpp"
 
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"  // GCC 12 takes an empty matrix for possible
+#endif
 #include <Eigen/Eigenvalues>
 
 namespace diffsim {
