@@ -100,8 +100,8 @@ class Worker:
 
     @classmethod
     def measure(cls, clock: Clock) -> dict[str, float]:
-        """Seconds each case takes."""
-        return {name: values[0] for name, values in in_turns(cls.cases, 1, clock).items()}
+        """Seconds each case takes, the second time: the first finds a processor that did something else meanwhile."""
+        return {name: values[1] for name, values in in_turns(cls.cases, 2, clock).items()}
 
 
 def row_of(count: int, facts: dict[str, float], rounds: list[dict[str, float]]) -> dict[str, float]:
