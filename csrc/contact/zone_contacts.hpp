@@ -52,7 +52,8 @@ struct Impact {
 enum class Clearance { floor, landing };
 
 /// How far the zone may go from an evaluated point towards y_end, vertices on straight lines, before some pair comes
-/// to its clearance, or nearer if it is below that already; at most 1. `impacts`, if given, receives the pairs that do, in the order of the contacts.
+/// to its clearance, or nearer if it is below that already; at most 1. `impacts`, if given, receives the pairs that do, in
+/// the order of the contacts.
 double allowed_step(
     const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts,
     Clearance clearance = Clearance::floor);

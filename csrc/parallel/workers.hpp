@@ -26,7 +26,8 @@ public:
 
     /// Call work(begin, end, thread) for ranges of at most `grain` that make up [0, count), and return when all are done.
     /// The owner takes ranges from the front and the others from the back, so that a thread mostly meets in one loop the
-    /// items that it had in the last, whose memory is near it; where they meet is left to chance. Throws the exception of the first range that threw one.
+    /// items that it had in the last, whose memory is near it; where they meet is left to chance. Throws the exception of
+    /// the first range that threw one.
     template <class Work>
     void for_each_range(int count, int grain, const Work& work) {
         if (m_thread_count > 1 && count > grain) {
