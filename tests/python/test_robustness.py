@@ -16,6 +16,7 @@ from penetration import PenetrationCheck
 
 import diffsim as ds
 from diffsim import scenes
+from diffsim.ops import RolloutCall, rollout
 
 STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
 FUZZ = Path(__file__).parent.parent / "fuzz.py"
@@ -175,6 +176,24 @@ def test_states_in_the_ground_are_refused_by_name(depth: float) -> None:
     position[0, 2] = 0.25 - depth
     with pytest.raises(ValueError, match=r"'cube'.*ground|ground.*'cube'"):
         sim(state.replace(position=position))
+
+
+def test_a_state_of_ours_in_the_ground_is_held_and_told() -> None:
+    """Between the segments of a rollout, that is: the same state that is refused as the caller's."""
+    sim = ds.Simulator(squeeze(), dt=0.01)
+    state = sim.initial_state()
+    position = state.position.clone()
+    position[0, 2] = 0.25 - 1e-3
+    tensors = (position, state.orientation, state.velocity, state.angular_velocity, *(None,) * 8)
+    parameters = (sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
+    with pytest.raises(ValueError, match="penetrate"):
+        rollout(RolloutCall(sim._model, sim._options, 2, 1), *tensors, *parameters)
+    call = RolloutCall(sim._model, sim._options, 2, 1, first_step=4)
+    end = rollout(call, *tensors, *parameters)
+    assert torch.equal(end[0], position)
+    assert call.info is not None
+    assert call.info.failed_steps == 2
+    assert call.info.failure == "objects penetrate at the start"
 
 
 @pytest.mark.parametrize("depth", [1e-4, 1e-3, 0.05])
