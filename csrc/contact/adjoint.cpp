@@ -196,7 +196,7 @@ Mat6 mass_matrix(const ZoneBody& body) {
 }
 
 /// Inertia and, exactly, elasticity of the cloths' free nodes.
-MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free, ElasticHessian kind) {
+MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free, CutShare cut) {
     const Eigen::Index first = 6 * zone.dynamic_count, size = free.size() - first;
     MatrixX matrix = MatrixX::Zero(size, size);
     if (size == 0) return matrix;
@@ -206,7 +206,7 @@ MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordin
     pattern.body_pairs.clear();
     cloth.set_pattern(std::move(pattern));
     cloth.set_zero();
-    if (zone.elastic) add_elastic_hessian(zone, point, kind, cloth);
+    if (zone.elastic) add_elastic_hessian(zone, point, cut, cloth);
     for (int i = 0; i < zone.node_count(); ++i) {
         if (free.row(i) < 0) continue;
         const Eigen::Index r = free.row(i) - first;
@@ -426,19 +426,18 @@ const ZoneAdjoint& zone_adjoint(
     std::vector<double> reactions;
     if (exact) {
         system.set_pattern(base_pattern(zone));
-        differentiate(zone, point, Curvature::exact, derivatives, &system);
+        differentiate(zone, point, Curvature::full, derivatives, &system);
         if (!system.factorize()) {
-            // Only where the forward stopped short of a minimum. The projected Hessian keeps the answer finite.
-            differentiate(zone, point, Curvature::projected, derivatives, &system);
+            // Only where the forward stopped short of a minimum. Without negative curvature the answer stays finite.
+            differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
             system.factorize();
         }
         reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) { system.solve_in_place(z); });
     } else {
         const FreeCoordinates free(zone);
         const Rows rows = collect_rows(zone, point, free);
-        MatrixX cloth = cloth_matrix(zone, point, free, ElasticHessian::exact);
-        if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success)
-            cloth = cloth_matrix(zone, point, free, ElasticHessian::projected);
+        MatrixX cloth = cloth_matrix(zone, point, free, kNothingCut);
+        if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success) cloth = cloth_matrix(zone, point, free, kAllCut);
         if (mode == AdjointMode::dense) {
             reactions = solve(
                 zone, point, result.multiplier, [&](Coordinates& z) { z = solve_dense(zone, free, cloth, rows, z); });

@@ -252,7 +252,7 @@ void cloth_model(const Zone& zone, const ZonePoint& point, BlockSystem& cloth, C
     pattern.body_pairs.clear();
     cloth.set_pattern(std::move(pattern));
     cloth.set_zero();
-    if (zone.elastic) add_elastic_hessian(zone, point, ElasticHessian::projected, cloth);
+    if (zone.elastic) add_elastic_hessian(zone, point, kAllCut, cloth);
     std::vector<Vec3> driven(zone.nodes.size(), Vec3::Zero());
     bool any_driven = false;
     for (int i = 0; i < zone.node_count(); ++i) {

@@ -18,6 +18,14 @@ struct Overloaded : Functions... {
 template <class... Functions>
 Overloaded(Functions...) -> Overloaded<Functions...>;
 
+/// A Hessian without this share of its negative part.
+template <int N>
+Square<N> cut_off(const Square<N>& hessian, CutShare cut) {
+    if (cut == kNothingCut) return hessian;
+    const Square<N> part = positive_part<N>(hessian);
+    return cut == kAllCut ? part : Square<N>(hessian + cut * (part - hessian));
+}
+
 /// |L⁻¹ g| of one body.
 double scaled_norm(const ZoneBody& body, const Vec6& gradient) {
     const Vec3 turn = gradient.head<3>();
@@ -27,8 +35,8 @@ double scaled_norm(const ZoneBody& body, const Vec6& gradient) {
 /// Adds up the contacts' derivatives along the bodies' twists and the nodes.
 class Assembler {
 public:
-    Assembler(const Zone& zone, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system)
-        : m_zone(zone), m_curvature(curvature), m_derivatives(derivatives), m_system(system) {}
+    Assembler(const Zone& zone, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives, BlockSystem* system)
+        : m_zone(zone), m_curvature(curvature), m_cut(cut), m_derivatives(derivatives), m_system(system) {}
 
     void add(const ZonePoint& point, const ActiveContact& active) {
         const ZoneContact& contact = m_zone.contacts[active.index];
@@ -120,24 +128,19 @@ private:
         if (yields(b)) add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
         if (m_system == nullptr) return;
         if (yields(a) && yields(b)) {
-            const Square<kA + kB> hessian = positive(d.hessian);
+            const Square<kA + kB> hessian = cut_off(d.hessian, m_cut);
             add_block(a, hessian.template topLeftCorner<kA, kA>());
             add_block(b, hessian.template bottomRightCorner<kB, kB>());
             add_cross(contact, a, b, hessian.template topRightCorner<kA, kB>());
         } else if (yields(a)) {
-            add_block(a, positive(Square<kA>(d.hessian.template topLeftCorner<kA, kA>())));
+            add_block(a, cut_off(Square<kA>(d.hessian.template topLeftCorner<kA, kA>()), m_cut));
         } else if (yields(b)) {
-            add_block(b, positive(Square<kB>(d.hessian.template bottomRightCorner<kB, kB>())));
+            add_block(b, cut_off(Square<kB>(d.hessian.template bottomRightCorner<kB, kB>()), m_cut));
         }
     }
 
     static const BodySide& base(const BodyPlace& place) { return place; }
     static const ClothSide& base(const ClothPlace& place) { return place; }
-
-    template <int N>
-    Square<N> positive(const Square<N>& hessian) const {
-        return m_curvature == Curvature::projected ? positive_part<N>(hessian) : hessian;
-    }
 
     void add_body_on_ground(const ZonePoint& point, const ZoneContact& contact, const ActiveContact& active) {
         const Vec3 arm = active.geometry.closest.point_a - point.poses[contact.a].t;
@@ -145,7 +148,7 @@ private:
             active.geometry.distance, arm, contact.range, contact.stiffness.value, m_curvature != Curvature::dropped);
         const BodyPlace place{{point.poses[contact.a].t}, contact.a};
         add_gradient(place, d.row, -d.force * d.row, d.force, d.stiffness);
-        if (m_system != nullptr) add_block(place, positive(d.hessian));
+        if (m_system != nullptr) add_block(place, cut_off(d.hessian, m_cut));
     }
 
     void add_node_on_ground(const ZoneContact& contact, const ActiveContact& active) {
@@ -161,6 +164,7 @@ private:
 
     const Zone& m_zone;
     Curvature m_curvature;
+    CutShare m_cut;
     ZoneDerivatives& m_derivatives;
     BlockSystem* m_system;
 };
@@ -172,7 +176,7 @@ void sort_unique(IndexPairs& pairs) {
 
 /// Inertia and elasticity of cloth: gradient and, if asked for, Hessian.
 void add_cloth(
-    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system) {
+    const Zone& zone, const ZonePoint& point, CutShare cut, ZoneDerivatives& derivatives, BlockSystem* system) {
     const double scale = zone.dt * zone.dt;
     std::vector<Vec3>& gradient = derivatives.gradient.nodes;
     if (zone.elastic) {
@@ -182,11 +186,7 @@ void add_cloth(
                 zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start,
                 point.nodes.data() + cloth.first_node, scale, gradient.data() + cloth.first_node);
         }
-        if (system != nullptr) {
-            const ElasticHessian kind =
-                curvature == Curvature::projected ? ElasticHessian::projected : ElasticHessian::exact;
-            add_elastic_hessian(zone, point, kind, *system);
-        }
+        if (system != nullptr) add_elastic_hessian(zone, point, cut, *system);
     }
     for (int i = 0; i < zone.node_count(); ++i) {
         const ZoneNode& node = zone.nodes[i];
@@ -391,7 +391,7 @@ void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSys
     system.set_pattern(std::move(pattern));
 }
 
-void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessian kind, BlockSystem& system) {
+void add_elastic_hessian(const Zone& zone, const ZonePoint& point, CutShare cut, BlockSystem& system) {
     const double scale = zone.dt * zone.dt;
     for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
         const ZoneCloth& cloth = zone.cloths[c];
@@ -400,7 +400,7 @@ void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessia
             add_node_block(zone, first + i, first + j, block, system);
         };
         visit_elastic_hessian(
-            zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start, point.nodes.data() + first, kind,
+            zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start, point.nodes.data() + first, cut,
             Overloaded{
                 [&](const TriangleHessian& element) {
                     for (int r = 0; r < 3; ++r)
@@ -422,7 +422,8 @@ void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessia
 }
 
 void differentiate(
-    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system) {
+    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
+    CutShare cut) {
     const int count = zone.dynamic_count;
     derivatives.gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     derivatives.torque.resize(static_cast<std::size_t>(count));
@@ -436,7 +437,7 @@ void differentiate(
         }
         system->set_zero();
     }
-    Assembler assembler(zone, curvature, derivatives, system);
+    Assembler assembler(zone, curvature, cut, derivatives, system);
     for (const ActiveContact& active : point.active) assembler.add(point, active);
 
     // From twists to coordinates. Bodies that have not turned and carry no torque need no change of chart.
@@ -462,12 +463,12 @@ void differentiate(
         Mat6& block = system->diagonal(i);
         if (turned && curvature != Curvature::dropped && !derivatives.torque[i].isZero(0.0)) {
             const Mat3 extra = chart_curvature(y, derivatives.torque[i]);
-            block.topLeftCorner<3, 3>() += curvature == Curvature::projected ? positive_part<3>(extra) : extra;
+            block.topLeftCorner<3, 3>() += cut_off<3>(extra, cut);
         }
         block.topLeftCorner<3, 3>() += body.inertia;
         block.diagonal().tail<3>().array() += body.mass;
     }
-    if (!zone.nodes.empty()) add_cloth(zone, point, curvature, derivatives, system);
+    if (!zone.nodes.empty()) add_cloth(zone, point, cut, derivatives, system);
     if (system == nullptr) return;
     const BlockPattern& pattern = system->pattern();
     for (int k = 0; k < static_cast<int>(pattern.body_pairs.size()); ++k) {

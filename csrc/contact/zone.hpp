@@ -138,10 +138,9 @@ std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, b
 
 /// How the second derivative is taken.
 enum class Curvature {
-    none,       ///< gradient only
-    exact,      ///< the Hessian
-    projected,  ///< every contact's part made positive semidefinite: a descent direction always
-    dropped     ///< contacts are rows of constant direction (the paper's linearised constraint)
+    none,    ///< gradient only
+    full,    ///< the Hessian, as much of its negative curvature cut off as told
+    dropped  ///< contacts are rows of constant direction (the paper's linearised constraint)
 };
 
 struct ZoneDerivatives {
@@ -158,15 +157,17 @@ BlockPattern base_pattern(const Zone& zone);
 void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSystem& system);
 
 /// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's base pattern, and is extended
-/// by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix.
+/// by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix. With all negative
+/// curvature cut off (CutShare), each contact's part is positive semidefinite as well.
 void differentiate(
-    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system);
+    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
+    CutShare cut = kNothingCut);
 
 /// Add a block to a system's rows of node i and columns of node j, once per pair. Pinned nodes have none.
 void add_node_block(const Zone& zone, int i, int j, const Mat3& block, BlockSystem& system);
 
 /// Add the elastic Hessian of the zone's cloths to a system, times dt². Pinned nodes are left out.
-void add_elastic_hessian(const Zone& zone, const ZonePoint& point, ElasticHessian kind, BlockSystem& system);
+void add_elastic_hessian(const Zone& zone, const ZonePoint& point, CutShare cut, BlockSystem& system);
 
 /// d(twist)/dy of a body at theta: turns by the left Jacobian, shifts unchanged.
 Mat6 chart_jacobian(const Vec6& y);

@@ -14,11 +14,13 @@ constexpr int kMaxStalls = 3;            // steps in a row that get a driven bod
 constexpr double kStall = 1e-3;          // of the way that is left
 constexpr double kHardTolerance = 1e-9;  // change of a hard contact's compression, of its range
 constexpr int kMaxHardRounds = 50;
-constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
-constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
-constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
-constexpr int kStepsBeforeExact = 3;       // with a cloth's projected Hessian, once the exact one was indefinite
+constexpr int kRelaxations = 8;      // Newton steps after driven bodies were stopped, before they go on
+constexpr double kRelaxed = 1e-2;    // residual at which they may go on earlier
+constexpr double kGoodEnough = 1e3;  // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;    // without halving the residual: rounding's sign
+constexpr CutShare kSmallestCut = 1.0 / 256.0;
+constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
+constexpr double kCutFactor = 4.0;
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
@@ -220,23 +222,27 @@ private:
         return std::sqrt(turn.dot(turn_metric * turn) + shift_metric * v.tail<3>().squaredNorm());
     }
 
-    void differentiate_here(Curvature curvature) {
-        differentiate(m_zone, m_w.point, curvature, m_w.derivatives, &m_w.system);
-    }
-
-    /// The Newton step, from the exact Hessian where that is positive definite. False if rounding spoils even the other.
+    /// The Newton step, from the exact Hessian where that is positive definite. Else negative curvature is cut off. With
+    /// cloth no more than needed, since it is what a sheet follows when it buckles: the share that it takes is searched from
+    /// one iteration to the next. False if rounding spoils even the Hessian without negative curvature.
     bool newton_step() {
-        m_factor_is_exact = false;
-        if (m_exact_in > 0) {
-            --m_exact_in;
-        } else {
-            differentiate_here(Curvature::exact);
-            m_factor_is_exact = m_w.system.factorize();
-            if (m_factor_is_exact) return solve_for_step();
-            if (!m_zone.nodes.empty()) m_exact_in = kStepsBeforeExact;
+        bool failed = false;
+        for (;;) {
+            differentiate(m_zone, m_w.point, Curvature::full, m_w.derivatives, &m_w.system, m_cut);
+            m_factor_is_exact = m_cut == kNothingCut;
+            if (m_w.system.factorize()) break;
+            if (m_cut == kAllCut) return false;
+            failed = true;
+            m_cut = m_cut == kNothingCut ? kFirstCut : std::min(kCutFactor * m_cut, kAllCut);
+            if (m_zone.nodes.empty()) m_cut = kAllCut;
         }
-        differentiate_here(Curvature::projected);
-        return m_w.system.factorize() && solve_for_step();
+        if (m_zone.nodes.empty()) {
+            m_cut = kNothingCut;
+        } else if (!failed) {
+            m_cut /= kCutFactor;
+            if (m_cut < kSmallestCut) m_cut = kNothingCut;
+        }
+        return solve_for_step();
     }
 
     bool solve_for_step() {
@@ -317,7 +323,7 @@ private:
     bool finish_with_this_factor() {
         if (m_zone.nodes.empty() || !m_zone.elastic || !m_factor_is_exact) return false;
         const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
-        differentiate_here(Curvature::none);
+        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
         m_w.derivatives.largest_stiffness = stiffness;
         const Accuracy now = accuracy();
         if (!(now.residual < std::max(m_options.tolerance, now.floor)) || !solve_for_step()) return false;
@@ -497,7 +503,7 @@ private:
     ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
     double m_position = 0.0;         // size of the numbers that distances are differences of [m]
-    int m_exact_in = 0;              // Newton steps until the exact Hessian is tried again
+    CutShare m_cut = kNothingCut;    // of the next Newton step
     bool m_factor_is_exact = false;  // the system's, of the exact Hessian
     bool m_rescue = false;           // some objects start the step below their floor
     ZoneResult m_result;

@@ -248,11 +248,11 @@ ClothParameters add_elastic_backward(
 }
 
 TriangleHessian triangle_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int id, ElasticHessian kind) {
+    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int id, CutShare cut) {
     const ClothTriangle& triangle = cloth.triangles[id];
     const Deformation F = deformation(triangle, x);
     Vec3 S = triangle.area * step_stress(law, green_strain(F), start.strain[id]);
-    if (kind == ElasticHessian::projected) S = positive_part(S);
+    if (cut > 0.0) S += cut * (positive_part(S) - S);
     const double gain = triangle.area * (1.0 + law.damping_over_dt);
     const double c11 = gain * law.c11, c12 = gain * law.c12, shear = gain * law.shear;
 
@@ -303,8 +303,8 @@ BentHinges bent_hinges(const Cloth& cloth, const ElasticLaw& law, const ElasticS
 }
 
 void set_hinge_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int id, ElasticHessian kind,
-    std::size_t& coupling, HingeHessian& result) {
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int id, CutShare cut, std::size_t& coupling,
+    HingeHessian& result) {
     const ClothHinge& hinge = cloth.hinges[id];
     const double stiffness = law.bend * (1.0 + law.damping_over_dt);
     result.nodes.assign(hinge.nodes.begin(), hinge.nodes.end());
@@ -324,8 +324,8 @@ void set_hinge_hessian(
             result.coupled[slot] += stiffness * entry.weight * bent.gradients[entry.b].col(k);
         }
     }
-    if (kind == ElasticHessian::exact)
-        result.curvature = 0.5 * bent.moments[id] * dihedral_hessian(bent.frames[id]);
+    if (cut < 1.0)
+        result.curvature = 0.5 * (1.0 - cut) * bent.moments[id] * dihedral_hessian(bent.frames[id]);
     else
         result.curvature.setZero();
 }

@@ -54,17 +54,20 @@ ClothParameters add_elastic_backward(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
     const Vec3* x_start, const Vec3* direction, double scale, Vec3* grad_x_start);
 
-/// Which second derivative of an element. `projected` is positive semidefinite, and equals `exact` wherever that is:
+/// How much of what can make a second derivative indefinite is cut off. kNothingCut leaves the exact one. kAllCut leaves a
+/// positive semidefinite one:
 ///  - Triangles: blocks (∂ε/∂xi)ᵀ C (∂ε/∂xj), always semidefinite, plus (giᵀ S gj) 1 with the stress S and the
 ///    gradients g of the shape functions. Along the triangle's normal the latter stands alone, so that the whole is
-///    semidefinite exactly when S is: `projected` cuts S to its positive part, for a square root. Clamping the
+///    semidefinite exactly when S is: the negative part of S is cut off, for a square root. Clamping the
 ///    eigenvalues of the 9 x 9 matrix would differ within the triangle's plane, by the cut stress beside the stiffness,
 ///    which is of the order of the strain.
 ///  - Bending: bend Σ W_ij ∇θ_i ∇θ_jᵀ, semidefinite as a sum over all hinges and couplings, plus Σ moment_i ∇²θ_i. Any
 ///    moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ with that away from the edge, against which
-///    the hinge has no stiffness. `projected` drops the moments' term.
+///    the hinge has no stiffness. The moments' term is cut off.
 /// Clamping eigenvalues instead would take some 4 µs per triangle and 7 µs per hinge, thirty times as long or more.
-enum class ElasticHessian { exact, projected };
+/// A share between them cuts off that part of it, and is semidefinite where enough is.
+using CutShare = double;
+inline constexpr CutShare kNothingCut = 0.0, kAllCut = 1.0;
 
 /// Second derivative of the energy of one triangle by its nodes' positions [N/m].
 struct TriangleHessian {
@@ -81,7 +84,7 @@ struct HingeHessian {
     std::vector<int> nodes;     ///< of the cloth: the hinge's four, then those of other hinges
     Mat34 gradient;             ///< of the hinge's angle, ∇θ_i
     std::vector<Vec3> coupled;  ///< per node: of bend (½ W_ii ∇θ_i + Σ W_ij ∇θ_j)
-    Mat12 curvature;            ///< ½ moment ∇²θ_i, or zero
+    Mat12 curvature;            ///< ½ moment ∇²θ_i, what is left of it
 
     Mat3 block(int r, int s) const {
         Mat3 result = gradient.col(r) * coupled[s].transpose();
@@ -110,27 +113,26 @@ struct BentHinges {
 BentHinges bent_hinges(const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x);
 
 TriangleHessian triangle_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int triangle,
-    ElasticHessian kind);
+    const Cloth& cloth, const ElasticLaw& law, const ElasticStart& start, const Vec3* x, int triangle, CutShare cut);
 
 /// Of the hinge whose couplings begin at `coupling`, which is moved on to those of the next.
 void set_hinge_hessian(
-    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int hinge, ElasticHessian kind,
-    std::size_t& coupling, HingeHessian& result);
+    const Cloth& cloth, const ElasticLaw& law, const BentHinges& bent, int hinge, CutShare cut, std::size_t& coupling,
+    HingeHessian& result);
 
 /// Call visit(element) with every TriangleHessian, then every HingeHessian.
 template <class Visit>
 void visit_elastic_hessian(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
-    ElasticHessian kind, Visit&& visit) {
+    CutShare cut, Visit&& visit) {
     const ElasticLaw law = elastic_law(cloth, parameters, dt);
     for (int t = 0; t < static_cast<int>(cloth.triangles.size()); ++t)
-        visit(triangle_hessian(cloth, law, start, x, t, kind));
+        visit(triangle_hessian(cloth, law, start, x, t, cut));
     const BentHinges bent = bent_hinges(cloth, law, start, x);
     HingeHessian element;
     std::size_t coupling = 0;
     for (int h = 0; h < static_cast<int>(cloth.hinges.size()); ++h) {
-        set_hinge_hessian(cloth, law, bent, h, kind, coupling, element);
+        set_hinge_hessian(cloth, law, bent, h, cut, coupling, element);
         visit(std::as_const(element));
     }
 }

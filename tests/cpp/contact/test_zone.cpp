@@ -129,11 +129,11 @@ struct Derivatives {
     MatrixX hessian;
 };
 
-Derivatives derivatives_at(const Zone& zone, const ZonePoint& point, Curvature curvature) {
+Derivatives derivatives_at(const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut = kNothingCut) {
     ZoneDerivatives derivatives;
     BlockSystem system;
     system.set_pattern(base_pattern(zone));
-    differentiate(zone, point, curvature, derivatives, &system);
+    differentiate(zone, point, curvature, derivatives, &system, cut);
     return {flatten(derivatives.gradient), curvature == Curvature::none ? MatrixX() : dense(system)};
 }
 
@@ -174,7 +174,7 @@ void for_stable_zones(int count, const Test& test) {
 
 TEST(zone_gradient_and_hessian_agree_with_differences) {
     for_stable_zones(4, [](const Zone& zone, const Coordinates& y, const ZonePoint& point) {
-        const Derivatives d = derivatives_at(zone, point, Curvature::exact);
+        const Derivatives d = derivatives_at(zone, point, Curvature::full);
         CHECK(point.contact_energy > 0.0);
         CHECK(d.gradient.cwiseAbs().minCoeff() > 0.0);
         const auto energy = [&](const VectorX& x) { return point_at(zone, y, x).energy; };
@@ -194,8 +194,8 @@ TEST(projected_hessian_is_never_indefinite) {
     int indefinite = 0;
     for_stable_zones(4, [&](const Zone& zone, const Coordinates&, const ZonePoint& point) {
         const MatrixX M = mass_matrix(zone);
-        const Derivatives exact = derivatives_at(zone, point, Curvature::exact);
-        const Derivatives projected = derivatives_at(zone, point, Curvature::projected);
+        const Derivatives exact = derivatives_at(zone, point, Curvature::full);
+        const Derivatives projected = derivatives_at(zone, point, Curvature::full, kAllCut);
         CHECK(projected.gradient == exact.gradient);
         // The contacts' part in coordinates: projected it is semidefinite, to rounding of its largest eigenvalue.
         CHECK(lowest_eigenvalue(projected.hessian - M) >= -1e-12 * projected.hessian.norm());
@@ -224,7 +224,7 @@ TEST(dropped_curvature_leaves_mass_and_rows) {
         }
         const Derivatives dropped = derivatives_at(zone, point, Curvature::dropped);
         CHECK_NEAR(dropped.hessian, expected, 1e-12 * expected.norm());
-        const Derivatives exact = derivatives_at(zone, point, Curvature::exact);
+        const Derivatives exact = derivatives_at(zone, point, Curvature::full);
         CHECK((dropped.hessian - exact.hessian).norm() > 1e-3 * exact.hessian.norm());
     });
 }
@@ -264,5 +264,5 @@ TEST(energy_without_contact_is_inertial) {
     for (int i = 0; i < 3; ++i) error.segment<6>(6 * i) = y.bodies[i] - zone.bodies[i].target;
     CHECK_NEAR(point.energy, 0.5 * error.dot(mass_matrix(zone) * error), 1e-13 * point.energy);
     CHECK(point.contact_energy == 0.0);
-    CHECK_NEAR(derivatives_at(zone, point, Curvature::exact).gradient, mass_matrix(zone) * error, 1e-13 * point.energy);
+    CHECK_NEAR(derivatives_at(zone, point, Curvature::full).gradient, mass_matrix(zone) * error, 1e-13 * point.energy);
 }

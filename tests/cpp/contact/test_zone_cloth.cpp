@@ -140,11 +140,11 @@ struct Derivatives {
 };
 
 /// Of the free coordinates; checks what stands at the others.
-Derivatives derivatives_at(const Zone& zone, const ZonePoint& point, Curvature curvature) {
+Derivatives derivatives_at(const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut = kNothingCut) {
     ZoneDerivatives derivatives;
     BlockSystem system;
     system.set_pattern(base_pattern(zone));
-    differentiate(zone, point, curvature, derivatives, &system);
+    differentiate(zone, point, curvature, derivatives, &system, cut);
     const VectorX gradient = flatten(derivatives.gradient);
     const std::vector<int> rows = free_rows(zone);
     Derivatives result{gradient(rows), {}};
@@ -218,7 +218,7 @@ void for_stable_zones(int count, const Test& test) {
 
 TEST(gradient_and_hessian_of_a_zone_with_cloth_agree_with_differences) {
     for_stable_zones(2, [](const Zone& zone, const Coordinates& y, const ZonePoint& point) {
-        const Derivatives d = derivatives_at(zone, point, Curvature::exact);
+        const Derivatives d = derivatives_at(zone, point, Curvature::full);
         CHECK(point.contact_energy > 0.0);
         CHECK(point.elastic_energy > 0.0);
         CHECK(d.gradient.cwiseAbs().minCoeff() > 0.0);
@@ -240,9 +240,12 @@ TEST(projected_hessian_of_a_zone_with_cloth_is_never_indefinite) {
     int indefinite = 0;
     for_stable_zones(3, [&](const Zone& zone, const Coordinates&, const ZonePoint& point) {
         const MatrixX M = mass_matrix(zone);
-        const Derivatives exact = derivatives_at(zone, point, Curvature::exact);
-        const Derivatives projected = derivatives_at(zone, point, Curvature::projected);
+        const Derivatives exact = derivatives_at(zone, point, Curvature::full);
+        const Derivatives projected = derivatives_at(zone, point, Curvature::full, kAllCut);
+        const Derivatives between = derivatives_at(zone, point, Curvature::full, 0.5);
         CHECK(projected.gradient == exact.gradient);
+        const MatrixX mean = 0.5 * (exact.hessian + projected.hessian);
+        CHECK_NEAR(between.hessian, mean, 1e-12 * mean.norm());
         CHECK(lowest_eigenvalue(projected.hessian - M) >= -1e-12 * projected.hessian.norm());
         CHECK(lowest_eigenvalue(projected.hessian) > 0.0);
         indefinite += lowest_eigenvalue(exact.hessian - M) < -1e-3 ? 1 : 0;
@@ -255,7 +258,7 @@ TEST(dropped_curvature_leaves_mass_elasticity_and_rows) {
         Zone loose = zone;
         loose.contacts.clear();
         const std::vector<int> rows = free_rows(zone);
-        MatrixX expected = derivatives_at(loose, point_at(loose, y, zero_change(loose)), Curvature::exact).hessian;
+        MatrixX expected = derivatives_at(loose, point_at(loose, y, zero_change(loose)), Curvature::full).hessian;
         const MatrixX without_contact = expected;
         for (const ActiveContact& active : point.active) {
             const ZoneContact& contact = zone.contacts[active.index];
