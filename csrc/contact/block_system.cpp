@@ -3,8 +3,6 @@
 #include <Eigen/Cholesky>
 #include <algorithm>
 
-#include "math/sparse_block_cholesky.hpp"
-
 namespace diffsim {
 namespace {
 
@@ -142,6 +140,14 @@ void BlockSystem::solve_in_place(Coordinates& rhs) const {
         Eigen::Map<VectorX> x(rhs.bodies[0].data(), 6 * m_pattern.body_count);
         solve(m_dense, x);
     }
+}
+
+HalfSolution BlockSystem::half_solve(const int* nodes, const Vec3* values, int count) const {
+    std::vector<int> blocks(nodes, nodes + count);
+    for (int& block : blocks) block += m_pattern.body_count;
+    HalfSolution result;
+    m_sparse->factor.half_solve(blocks, values->data(), result);
+    return result;
 }
 
 void BlockSystem::multiply(const Coordinates& in, Coordinates& out) const {

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "contact/coordinates.hpp"
+#include "math/sparse_block_cholesky.hpp"
 
 namespace diffsim {
 
@@ -63,6 +64,8 @@ public:
     bool factorize();
     /// Overwrite the right-hand side by the solution. Needs a successful factorize().
     void solve_in_place(Coordinates& rhs) const;
+    /// Half of the solution for a right-hand side that is zero but for these nodes. For systems with nodes.
+    HalfSolution half_solve(const int* nodes, const Vec3* values, int count) const;
     /// out = matrix * in.
     void multiply(const Coordinates& in, Coordinates& out) const;
 

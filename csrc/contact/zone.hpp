@@ -26,6 +26,20 @@ struct ZoneBody {
     Vec6 warm = Vec6::Zero();    ///< last step's motion: dt (w0, v0)
 };
 
+/// M p
+inline Vec6 mass_times(const ZoneBody& body, const Vec6& p) {
+    Vec6 result;
+    result << body.inertia * p.head<3>(), body.mass * p.tail<3>();
+    return result;
+}
+
+/// M⁻¹ p
+inline Vec6 inverse_mass_times(const ZoneBody& body, const Vec6& p) {
+    Vec6 result;
+    result << body.inverse_inertia * p.head<3>(), p.tail<3>() / body.mass;
+    return result;
+}
+
 struct ZoneNode {
     Vec3 start = Vec3::Zero();  ///< at the start of the step, zone frame
     double mass = 0.0;

@@ -420,7 +420,7 @@ private:
         for (int k = 0; k < 8 && !is_covered(m_zone, m_coverage, direction.y_end); ++k) {
             list_contacts(direction.y_end);
             evaluate(m_zone, m_w.point);
-            direction = impact_direction(m_zone, m_w.point, m_w.system);
+            direction = impact_direction(m_zone, m_w.point, m_w.system, &direction);
         }
         const Coordinates newton_end = m_w.y_end;
         m_w.y_end = direction.y_end;

@@ -2,7 +2,7 @@
 
 #include <optional>
 
-#include "contact/impact_qp.hpp"
+#include "contact/impact_direction.hpp"
 
 namespace diffsim {
 

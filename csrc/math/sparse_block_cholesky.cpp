@@ -299,6 +299,7 @@ void SparseBlockCholesky::analyze(const std::vector<int>& sizes, const std::vect
     m_entries.clear();
     m_solve_runs.clear();
     m_parent_runs.clear();
+    m_block_sizes = sizes;
     m_row_count = 0;
     m_factor_size = 0;
     if (sizes.empty()) return;
@@ -315,6 +316,7 @@ void SparseBlockCholesky::analyze(const std::vector<int>& sizes, const std::vect
     analysis.front_row.resize(sizes.size());
     for (int s = static_cast<int>(node_count) - 1; s >= 0; --s) {
         const int parent = analysis.partition.parent[s];
+        m_supernodes[s].parent = parent;
         if (parent >= 0) analysis.children.push_front(parent, s);
         m_supernodes[s].stack = parent < 0 ? 0 : 1 - m_supernodes[parent].stack;
     }
@@ -335,13 +337,18 @@ void SparseBlockCholesky::number_rows(Analysis& analysis) {
     analysis.place_of_block = inverse_of(analysis.partition.order);
     analysis.node_of_place.resize(count);
     analysis.start_of_place.resize(count);
+    m_node_of_block.resize(count);
+    m_first_row.resize(count);
     for (int s = 0; s < static_cast<int>(m_supernodes.size()); ++s) {
         m_supernodes[s].first = m_row_count;
         for (int place = analysis.begin(s); place < analysis.end(s); ++place) {
             const int size = analysis.size_at(place);
             analysis.node_of_place[place] = s;
             analysis.start_of_place[place] = m_row_count;
-            m_permutation.push_back({natural_start[analysis.partition.order[place]], m_row_count, size});
+            const int block = analysis.partition.order[place];
+            m_node_of_block[block] = s;
+            m_first_row[block] = m_row_count;
+            m_permutation.push_back({natural_start[block], m_row_count, size});
             m_row_count += size;
         }
     }
@@ -447,6 +454,7 @@ void SparseBlockCholesky::reserve_storage() {
     m_solution.reserve(static_cast<std::size_t>(m_row_count));
     m_front_x.reserve(front_rows);
     m_partials.reserve(kTile * width);
+    m_reached.assign(m_supernodes.size(), 0);
 }
 
 void SparseBlockCholesky::assemble_panel(
@@ -520,23 +528,73 @@ bool SparseBlockCholesky::factorize(const double* const* diagonal, const double*
     return true;
 }
 
+void SparseBlockCholesky::eliminate(const Supernode& node, double* x, double* own) const {
+    double* const z = m_front_x.data();
+    const int width = node.padded_width, rows = width + node.padded_below;
+    std::copy_n(x + node.first, node.width, z);
+    std::fill(z + node.width, z + rows, 0.0);
+    cholesky_kernels().solve(m_factor.data() + node.factor, m_inverse_diagonal.data() + node.inverse, width, rows, z);
+    std::copy_n(z, node.width, own);
+    for (int k = node.solve_run_begin; k < node.solve_run_end; ++k) {
+        const Run& run = m_solve_runs[k];
+        for (int i = 0; i < run.count; ++i) x[run.from + i] += z[width + run.to + i];
+    }
+}
+
+void SparseBlockCholesky::half_solve(const std::vector<int>& blocks, const double* values, HalfSolution& result) const {
+    double* const y = m_solution.data();
+    result.groups.clear();
+    for (const int block : blocks) {
+        for (int s = m_node_of_block[block]; s >= 0 && m_reached[s] == 0; s = m_supernodes[s].parent) {
+            m_reached[s] = 1;
+            result.groups.push_back(s);
+        }
+    }
+    std::sort(result.groups.begin(), result.groups.end());
+    for (const int s : result.groups) std::fill_n(y + m_supernodes[s].first, m_supernodes[s].width, 0.0);
+    for (const int block : blocks) {
+        const int size = m_block_sizes[block];
+        for (int i = 0; i < size; ++i) y[m_first_row[block] + i] += values[i];
+        values += size;
+    }
+    result.start.assign(1, 0);
+    for (const int s : result.groups)
+        result.start.push_back(result.start.back() + static_cast<std::size_t>(m_supernodes[s].width));
+    result.values.resize(result.start.back());
+    for (std::size_t k = 0; k < result.groups.size(); ++k) {
+        const int s = result.groups[k];
+        eliminate(m_supernodes[s], y, result.values.data() + result.start[k]);
+        m_reached[s] = 0;
+    }
+}
+
+double HalfSolution::dot(const HalfSolution& other) const {
+    double sum = 0.0;
+    std::size_t i = 0, j = 0;
+    while (i < groups.size() && j < other.groups.size()) {
+        if (groups[i] < other.groups[j]) {
+            ++i;
+        } else if (groups[i] > other.groups[j]) {
+            ++j;
+        } else {
+            const double* const a = values.data() + start[i];
+            const double* const b = other.values.data() + other.start[j];
+            const std::size_t count = start[i + 1] - start[i];
+            for (std::size_t k = 0; k < count; ++k) sum += a[k] * b[k];
+            ++i;
+            ++j;
+        }
+    }
+    return sum;
+}
+
 void SparseBlockCholesky::solve_in_place(double* x) const {
     const CholeskyKernels& kernels = cholesky_kernels();
     double* const y = m_solution.data();
     double* const z = m_front_x.data();
     for (const Run& run : m_permutation) std::copy_n(x + run.from, run.count, y + run.to);
 
-    for (const Supernode& node : m_supernodes) {
-        const int width = node.padded_width, rows = width + node.padded_below;
-        std::copy_n(y + node.first, node.width, z);
-        std::fill(z + node.width, z + rows, 0.0);
-        kernels.solve(m_factor.data() + node.factor, m_inverse_diagonal.data() + node.inverse, width, rows, z);
-        std::copy_n(z, node.width, y + node.first);
-        for (int k = node.solve_run_begin; k < node.solve_run_end; ++k) {
-            const Run& run = m_solve_runs[k];
-            for (int i = 0; i < run.count; ++i) y[run.from + i] += z[width + run.to + i];
-        }
-    }
+    for (const Supernode& node : m_supernodes) eliminate(node, y, y + node.first);
     for (auto s = m_supernodes.rbegin(); s != m_supernodes.rend(); ++s) {
         const Supernode& node = *s;
         const int width = node.padded_width, rows = width + node.padded_below;

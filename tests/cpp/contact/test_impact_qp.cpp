@@ -244,6 +244,54 @@ TEST(impact_qp_with_nodes_agrees_with_a_slow_reference) {
     CHECK(cases_hit >= 10);
 }
 
+TEST(forces_of_impacts_give_what_the_qp_gives) {
+    check::Random random(6);
+    int cases_hit = 0;
+    for (int k = 0; k < 40; ++k) {
+        NOTE(k);
+        Problem problem = random_problem_with_nodes(random, k % 4, 6 + k % 13, k % 2 == 0 ? 100.0 : 1e6);
+        Coordinates expected = fixtures::unflatten(VectorX::Zero(problem.size()), problem.zone.dynamic_count);
+        Coordinates p = expected;
+        p.nodes[0] = expected.nodes[0] = Vec3(0.1, 0.2, 0.3);  // pinned
+        problem.solve(expected);
+        ImpactForces forces(problem.zone, problem.inertial_gradient, problem.cloth);
+        int steps = 0;
+        CHECK(forces.solve(problem.mass_factor, problem.rows, p, steps));
+        CHECK(steps < 50);
+        CHECK_NEAR(flatten(p), flatten(expected), 1e-7 * (1.0 + flatten(expected).norm()));
+        CHECK(p.nodes[0] == Vec3(0.1, 0.2, 0.3));
+        cases_hit += active_rows(problem, flatten(p)) >= 2 ? 1 : 0;
+
+        // The same from other starts: with heavier bodies, with rows that come later, from its own end.
+        for (double& factor : problem.mass_factor) factor *= 2.0;
+        problem.solve(expected);
+        CHECK(forces.solve(problem.mass_factor, problem.rows, p, steps));
+        CHECK_NEAR(flatten(p), flatten(expected), 1e-7 * (1.0 + flatten(expected).norm()));
+        ImpactForces anew(problem.zone, problem.inertial_gradient, problem.cloth);
+        const std::vector<ImpactRow> first(problem.rows.begin(), problem.rows.begin() + 4);
+        CHECK(anew.solve(problem.mass_factor, first, p, steps));
+        CHECK(anew.solve(problem.mass_factor, problem.rows, p, steps));
+        CHECK_NEAR(flatten(p), flatten(expected), 1e-7 * (1.0 + flatten(expected).norm()));
+        ImpactForces again(problem.zone, problem.inertial_gradient, problem.cloth);
+        again.start_from(problem.rows, p);
+        CHECK(again.solve(problem.mass_factor, problem.rows, p, steps));
+        CHECK(steps <= 2);
+        CHECK_NEAR(flatten(p), flatten(expected), 1e-7 * (1.0 + flatten(expected).norm()));
+    }
+    CHECK(cases_hit >= 20);
+}
+
+TEST(too_many_forces_of_impacts_are_left_to_the_qp) {
+    check::Random random(7);
+    Problem problem = random_problem_with_nodes(random, 0, 200, 100.0);  // 10 per root of 9 nodes are too many
+    for (ImpactRow& row : problem.rows) row.missing = 10.0;
+    ImpactForces forces(problem.zone, problem.inertial_gradient, problem.cloth);
+    Coordinates p = fixtures::unflatten(VectorX::Zero(problem.size()), 0);
+    int steps = 0;
+    CHECK(!forces.solve(problem.mass_factor, problem.rows, p, steps));
+    CHECK(flatten(p).isZero(0.0));
+}
+
 TEST(impact_qp_does_not_depend_on_the_start) {
     check::Random random(3);
     for (int k = 0; k < 10; ++k) {

@@ -303,6 +303,44 @@ TEST(sparse_block_cholesky_refuses_what_is_not_positive_definite) {
     check_solution(cholesky, system, random);  // usable as ever
 }
 
+TEST(half_solutions_give_products_with_the_inverse) {
+    check::Random random(8);
+    std::vector<System> systems;
+    systems.push_back(make_system(random_sizes(random, 30, {3, 6}), random_pairs(random, 30, 0.1), random));
+    systems.push_back(make_system(std::vector<int>(100, 3), sheet_pairs(10), random));
+    systems.push_back(make_system({3, 6, 2, 3}, {}, random));  // nothing coupled
+    for (const System& system : systems) {
+        SparseBlockCholesky cholesky;
+        CHECK(factorize(cholesky, system));
+        const std::vector<int> start = system.starts();
+        const int count = static_cast<int>(system.sizes.size());
+        std::vector<HalfSolution> halves;
+        std::vector<VectorX> rhs;
+        for (int k = 0; k < 12; ++k) {
+            std::vector<int> blocks;
+            std::vector<double> values;
+            rhs.push_back(VectorX::Zero(start.back()));
+            for (int b = 0; b < 1 + k % 3; ++b) {
+                const int block = static_cast<int>(random.uniform(0.0, count));  // may come twice
+                const VectorX part = random.vector(system.sizes[block]);
+                blocks.push_back(block);
+                values.insert(values.end(), part.begin(), part.end());
+                rhs.back().segment(start[block], part.size()) += part;
+            }
+            cholesky.half_solve(blocks, values.data(), halves.emplace_back());
+        }
+        for (std::size_t i = 0; i < rhs.size(); ++i) {
+            const VectorX x = solve(cholesky, rhs[i]);
+            for (std::size_t j = 0; j < rhs.size(); ++j) {
+                const double product = halves[i].dot(halves[j]);
+                CHECK(product == halves[j].dot(halves[i]));
+                CHECK_NEAR(product, x.dot(rhs[j]), kRounding * (1.0 + x.norm() * rhs[j].norm()));
+            }
+            CHECK(halves[i].dot(halves[i]) > 0.0);
+        }
+    }
+}
+
 TEST(sparse_block_cholesky_is_deterministic) {
     check::Random random(7);
     const System system = sheet_with_bodies(14, 3, random), other = sheet_with_bodies(6, 1, random);
