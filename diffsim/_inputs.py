@@ -1,12 +1,13 @@
-"""The forms that state, controls and parameters may take, turned into the float64 tensors of the operator."""
+"""Between what users hand over and the operator: state, controls and parameters in, the next state out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ._check import (
     CONTROL_FIELDS,
@@ -18,11 +19,81 @@ from ._check import (
     check_state,
     message,
 )
-from .state import Control
+from .state import Control, State
 
 Controls = Control | Sequence[Control] | None
 #: Of the operator: 6 of the state, 6 of the control, 8 parameters; those of cloth are None in a scene without.
 Inputs = tuple[Tensor | None, ...]
+
+_NOT_DRIVEN = (None,) * 6  # the controls, in the order of the operator
+
+
+def plain_inputs(
+    state: Any,
+    control: Any,
+    mass: Tensor,
+    inertia: Tensor,
+    gravity: Tensor,
+    state_shapes: tuple[torch.Size, torch.Size, torch.Size],
+    parameter_shapes: tuple[torch.Size, torch.Size, torch.Size],
+) -> Inputs | None:
+    """The operator's inputs in a scene without cloth if nothing has to be converted or complained about; else None.
+
+    Kept fast: it is a good part of what a small step costs in Python. The shapes are those without a batch axis, of
+    position, orientation and nodes, and of mass, inertia and gravity.
+    """
+    if type(state) is not State:
+        return None
+    f64 = torch.float64
+    vector, quaternion, nodes = state_shapes
+    position, orientation = state.position, state.orientation
+    velocity, angular_velocity = state.velocity, state.angular_velocity
+    try:
+        if position.shape != vector:
+            if position.ndim != 3:
+                return None
+            batch = position.shape[0]
+            vector, quaternion, nodes = (torch.Size((batch, *shape)) for shape in state_shapes)
+        mass_shape, inertia_shape, gravity_shape = parameter_shapes
+        if not (
+            position.dtype is f64
+            and orientation.dtype is f64
+            and velocity.dtype is f64
+            and angular_velocity.dtype is f64
+            and mass.dtype is f64
+            and inertia.dtype is f64
+            and gravity.dtype is f64
+            and position.shape == vector
+            and orientation.shape == quaternion
+            and velocity.shape == vector
+            and angular_velocity.shape == vector
+            and mass.shape == mass_shape
+            and inertia.shape == inertia_shape
+            and gravity.shape == gravity_shape
+            and position.is_cpu
+            and orientation.is_cpu
+            and velocity.is_cpu
+            and angular_velocity.is_cpu
+            and mass.is_cpu
+            and inertia.is_cpu
+            and gravity.is_cpu
+            and state.node_position.shape == nodes
+            and state.node_velocity.shape == nodes
+        ):
+            return None
+        driven: tuple[Any, ...] = _NOT_DRIVEN
+        if control is not None:
+            if type(control) is not Control or control.node_force is not None or control.node_velocity is not None:
+                return None
+            force, torque = control.force, control.torque
+            driven = (force, torque, None, control.body_velocity, control.body_angular_velocity, None)
+            for t in driven:
+                if t is not None and not (t.dtype is f64 and t.shape == vector and t.is_cpu):
+                    return None
+    except AttributeError:  # not a tensor
+        return None
+    moving = position, orientation, velocity, angular_velocity, None, None
+    return *moving, *driven, mass, inertia, gravity, None, None, None, None, None
 
 
 def checked_inputs(
@@ -156,3 +227,43 @@ def _parameters(
         batch = check_shape(where, name, tensor, shape, batch)
         checked.append(tensor)
     return checked, batch
+
+
+def check_unused(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    """Refuse values other than 0 of a parameter that contact makes no use of yet."""
+    if type(tensor) is not nn.Parameter or tensor.shape != shape:  # exchanged for this call
+        check_shape("Simulator", name, check_float_tensor("Simulator", name, tensor), shape, None)
+    values = _unwrapped_values(tensor) if torch._C._are_functorch_transforms_active() else tensor.numpy(force=True)
+    if values.tobytes().strip(b"\0") and values.any():  # .any() alone takes half as long as a small step
+        raise NotImplementedError(f"Simulator: {name} must be 0, contact has none in this version yet")
+
+
+def _unwrapped_values(tensor: Tensor) -> np.ndarray:
+    """What torch.func's transforms have wrapped: all values, mapped axes of vmap among the axes."""
+    while torch._C._functorch.is_functorch_wrapped_tensor(tensor):
+        tensor = torch._C._functorch.get_unwrapped(tensor)
+    with torch._C._DisableFuncTorch():  # or they would wrap what is done here, too
+        return tensor.numpy(force=True)
+
+
+def state_from(outputs: tuple[Tensor | None, ...], state: State) -> State:
+    """The operator's outputs as a state of the given state's dtype; without cloth, with the given state's empty one."""
+    if state.position.dtype is not torch.float64:
+        dtype = state.position.dtype
+        outputs = tuple(None if t is None else t.to(dtype) for t in outputs)
+    position, orientation, velocity, angular_velocity, node_position, node_velocity = outputs
+    assert position is not None  # bodies always are, if only none of them
+    if node_position is None or node_velocity is None:
+        node_position, node_velocity = state.node_position, state.node_velocity
+    if node_position.ndim != position.ndim or node_position.shape[:-2] != position.shape[:-2]:
+        leading = position.shape[:-2]
+        node_position = node_position.expand(*leading, *node_position.shape[-2:])
+        node_velocity = node_velocity.expand(*leading, *node_velocity.shape[-2:])
+    return State._make(
+        position=position,
+        orientation=orientation,
+        velocity=velocity,
+        angular_velocity=angular_velocity,
+        node_position=node_position,
+        node_velocity=node_velocity,
+    )

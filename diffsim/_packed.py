@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from . import _core
 from ._arguments import KINDS, Kind, positive
 from ._body_shape import Shape
 from ._cloth_shape import ClothShape
@@ -208,4 +209,29 @@ def rotation_matrix(q: FloatArray) -> FloatArray:
             [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
+    )
+
+
+def core_model(p: PackedScene) -> _core.Model:
+    return _core.Model(
+        names=list(p.names),
+        kind=p.kind,
+        margin=p.margin,
+        vertex_count=p.vertex_count,
+        vertices=p.vertices,
+        face_count=p.face_count,
+        faces=p.faces,
+        has_ground=p.has_ground,
+        ground_height=p.ground_height,
+        ground_margin=p.ground_margin,
+        thickness=p.thickness,
+        cloth_names=list(p.cloth_names),
+        cloth_margin=p.cloth_margin,
+        cloth_poisson=p.cloth_poisson,
+        node_count=p.node_count,
+        triangle_count=p.triangle_count,
+        triangles=p.triangles,
+        node_rest=p.node_rest,
+        warp=p.warp,
+        pinned=p.pinned,
     )

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from . import _core
 from ._check import (
@@ -18,33 +14,22 @@ from ._check import (
     PARAMETERS,
     check_choice,
     check_count,
-    check_float_tensor,
     check_instance,
     check_number,
-    check_shape,
 )
 from ._cloth_energy import cloth_elements
-from ._inputs import Controls, Inputs, checked_inputs
+from ._description import description
+from ._inputs import Controls, Inputs, check_unused, checked_inputs, plain_inputs, state_from
 from ._measurements import Measurements
-from .ops import ConvergenceWarning, FastImpactWarning, Info, RolloutCall, SolverError, rollout
+from ._outcome import combined, failure_text, warn_of_failure, warn_of_fast_impacts
+from ._packed import core_model
+from ._progress import progress_bar
+from .ops import Info, RolloutCall, SolverError, rollout
 from .scene import Scene
 from .state import Control, State
 
 __all__ = ["Simulator"]
 
-# What to try, by why the core says a step failed.
-_MENDS = {
-    "max_iterations reached": "try a larger max_iterations or a smaller dt",
-    "no step lowers the energy": "try a smaller dt or a larger tolerance",
-    "a body spins too fast": "check angular velocities and torques; a smaller dt allows for faster ones",
-    "a driven body is blocked: something is squeezed": (
-        "check what the kinematic bodies squeeze and how far they are driven, or try a smaller dt"
-    ),
-    "objects penetrate at the start": "move them apart, for instance with sim.separate(state)",
-}
-_USUAL_MEND = "try a smaller dt or a larger max_iterations"
-
-_NOT_DRIVEN = (None,) * 6  # the controls, in the order of the operator
 _ITERATIONS = 200  # a step of bodies that takes more will not converge
 _CLOTH_ITERATIONS = 2000  # stiff cloth at large time steps crumples slowly
 
@@ -156,28 +141,7 @@ class Simulator(Measurements):
     def _build(self) -> None:
         """What is made from the packed scene and cannot be pickled."""
         p = self._packed
-        self._model = _core.Model(
-            names=list(p.names),
-            kind=p.kind,
-            margin=p.margin,
-            vertex_count=p.vertex_count,
-            vertices=p.vertices,
-            face_count=p.face_count,
-            faces=p.faces,
-            has_ground=p.has_ground,
-            ground_height=p.ground_height,
-            ground_margin=p.ground_margin,
-            thickness=p.thickness,
-            cloth_names=list(p.cloth_names),
-            cloth_margin=p.cloth_margin,
-            cloth_poisson=p.cloth_poisson,
-            node_count=p.node_count,
-            triangle_count=p.triangle_count,
-            triangles=p.triangles,
-            node_rest=p.node_rest,
-            warp=p.warp,
-            pinned=p.pinned,
-        )
+        self._model = core_model(p)
         self._options = _core.Options(**self._settings)
         self._elements = cloth_elements(p, self._model) if p.cloth_names else None
         n = self._body_count = len(p.names)
@@ -221,8 +185,11 @@ class Simulator(Measurements):
     def info(self) -> Info | None:
         """Statistics of the last step; None before the first."""
         if isinstance(self._info, list):
-            self._info = _combined(self._info)
+            self._info = combined(self._info)
         return self._info
+
+    def __repr__(self) -> str:
+        return description(type(self).__name__, self._packed, self._settings)
 
     # ---- states ------------------------------------------------------------------------------------------------------
 
@@ -268,7 +235,10 @@ class Simulator(Measurements):
             SolverError: A step did not converge, if ``on_failure="raise"``.
         Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
         """
-        inputs = self._float64_inputs(state, control)
+        inputs = None
+        if not self._node_count:
+            shapes = self._state_shapes, self._parameter_shapes
+            inputs = plain_inputs(state, control, self.mass, self.inertia, self.gravity, *shapes)
         if inputs is None:  # anything but float64 tensors in the plainest shapes
             inputs, _ = self._checked_inputs("Simulator", state, control, None)
         if self._check:
@@ -276,7 +246,7 @@ class Simulator(Measurements):
         threads = self._num_threads or torch.get_num_threads()
         call = RolloutCall(self._model, self._options, 1, threads)
         outputs = rollout(call, *inputs)  # type: ignore[arg-type]
-        result = _result(outputs, state)
+        result = state_from(outputs, state)
         self._finish([call.info], result)
         return result
 
@@ -328,7 +298,7 @@ class Simulator(Measurements):
         threads = self._num_threads or torch.get_num_threads()
         now, driven, parameters = inputs[:6], inputs[6:12], inputs[12:]
         segments, infos, signatures = [], [], []
-        with _progress_bar(steps, progress) as advance:
+        with progress_bar(steps, progress) as advance:
             for start in range(0, steps, length):
                 count = min(length, steps - start)
                 call = RolloutCall(
@@ -356,65 +326,9 @@ class Simulator(Measurements):
         outputs = segments[0]
         if len(segments) > 1:
             outputs = tuple(None if column[0] is None else torch.cat(column) for column in zip(*segments))
-        result = _result(outputs, state)
+        result = state_from(outputs, state)
         self._finish(infos, result)
         return result, np.concatenate(signatures) if want_signature else None  # type: ignore[arg-type]
-
-    def _float64_inputs(self, state: Any, control: Any) -> Inputs | None:
-        """The operator's tensors if nothing has to be converted or complained about; None otherwise. Kept fast."""
-        if self._node_count or type(state) is not State:
-            return None
-        f64 = torch.float64
-        vector, quaternion, nodes = self._state_shapes
-        position, orientation = state.position, state.orientation
-        velocity, angular_velocity = state.velocity, state.angular_velocity
-        mass, inertia, gravity = self.mass, self.inertia, self.gravity
-        try:
-            if position.shape != vector:
-                if position.ndim != 3:
-                    return None
-                batch = position.shape[0]
-                vector, quaternion, nodes = (torch.Size((batch, *shape)) for shape in self._state_shapes)
-            mass_shape, inertia_shape, gravity_shape = self._parameter_shapes
-            if not (
-                position.dtype is f64
-                and orientation.dtype is f64
-                and velocity.dtype is f64
-                and angular_velocity.dtype is f64
-                and mass.dtype is f64
-                and inertia.dtype is f64
-                and gravity.dtype is f64
-                and position.shape == vector
-                and orientation.shape == quaternion
-                and velocity.shape == vector
-                and angular_velocity.shape == vector
-                and mass.shape == mass_shape
-                and inertia.shape == inertia_shape
-                and gravity.shape == gravity_shape
-                and position.is_cpu
-                and orientation.is_cpu
-                and velocity.is_cpu
-                and angular_velocity.is_cpu
-                and mass.is_cpu
-                and inertia.is_cpu
-                and gravity.is_cpu
-                and state.node_position.shape == nodes
-                and state.node_velocity.shape == nodes
-            ):
-                return None
-            driven: tuple[Any, ...] = _NOT_DRIVEN
-            if control is not None:
-                if type(control) is not Control or control.node_force is not None or control.node_velocity is not None:
-                    return None
-                force, torque = control.force, control.torque
-                driven = (force, torque, None, control.body_velocity, control.body_angular_velocity, None)
-                for t in driven:
-                    if t is not None and not (t.dtype is f64 and t.shape == vector and t.is_cpu):
-                        return None
-        except AttributeError:  # not a tensor
-            return None
-        moving = position, orientation, velocity, angular_velocity, None, None
-        return *moving, *driven, mass, inertia, gravity, None, None, None, None, None
 
     def _checked_inputs(self, where: str, state: Any, controls: Any, steps: int | None) -> tuple[Inputs, bool]:
         shapes = (*self._parameter_shapes, *(self._packed.cloth_density.shape,) * len(CLOTH_PARAMETERS))
@@ -423,78 +337,25 @@ class Simulator(Measurements):
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
     def _check_unused_parameters(self) -> None:
-        for name in ("friction", "restitution"):
-            tensor = getattr(self, name)
-            if type(tensor) is not nn.Parameter or tensor.shape != self._object_shape:  # exchanged for this call
-                check_shape("Simulator", name, check_float_tensor("Simulator", name, tensor), self._object_shape, None)
-            transforms = torch._C._are_functorch_transforms_active()
-            values = _unwrapped_values(tensor) if transforms else tensor.numpy(force=True)
-            if values.tobytes().strip(b"\0") and values.any():  # .any() alone takes half as long as a small step
-                raise NotImplementedError(f"Simulator: {name} must be 0, contact has none in this version yet")
+        check_unused("friction", self.friction, self._object_shape)
+        check_unused("restitution", self.restitution, self._object_shape)
 
     def _finish(self, segments: list[Any], result: State) -> None:
         """Keeps the statistics of the call, and warns or raises if a step did not converge."""
         self.__dict__["_info"] = segments  # nn.Module's __setattr__ and Info itself take too long
         if not self._warned_fast and any(segment.fast_impacts for segment in segments):
             self._warned_fast = True
-            warnings.warn(
-                "Simulator: bodies met that move about as far in a step as the smaller of them is large; within a few"
-                " steps they can come around each other. Use a smaller dt; see also sim.info.fast_impacts",
-                FastImpactWarning,
-                stacklevel=_frames_to_user(),
-            )
+            warn_of_fast_impacts()
         if all(segment.converged for segment in segments):
             return
         info = self.info
         assert info is not None  # a call was made
-        text = (
-            f"Simulator: {info.failed_steps} step(s) did not converge, the first because: {info.failure}. The last step"
-            f" of the call took {info.iterations} iterations to a relative residual of {info.residual:.3g} (tolerance"
-            f" {self._settings['tolerance']:g}). The last penetration-free state is returned;"
-            f" {_MENDS.get(info.failure, _USUAL_MEND)}; see also sim.info"
-        )
+        text = failure_text(info, self._settings["tolerance"])
         if self._on_failure == "raise":
             raise SolverError(text, info, result)
         if not self._warned:
             self._warned = True
-            warnings.warn(text, ConvergenceWarning, stacklevel=_frames_to_user())
-
-    # ---- description -------------------------------------------------------------------------------------------------
-
-    def __repr__(self) -> str:
-        runs, left_out = self._stages()
-        bodies = f"{self._body_count} " + ("body" if self._body_count == 1 else "bodies")
-        if self._node_count:
-            count = len(self.cloth_names)
-            bodies += f", {count} {'cloth' if count == 1 else 'cloths'} of {self._node_count} nodes"
-        settings = ", ".join(f"{name}={value!r}" for name, value in self._settings.items())
-        return (
-            f"{type(self).__name__}({bodies}, thickness={self.thickness:g}, {settings})\n"
-            f"  runs: {', '.join(runs) or 'nothing'}\n"
-            f"  leaves out: {', '.join(left_out) or 'nothing'}"
-        )
-
-    def _stages(self) -> tuple[list[str], list[str]]:
-        count = np.bincount(self._packed.kind, minlength=3)
-        n, dynamic, kinematic = self._body_count, int(count[0]), int(count[2])
-        runs: list[str] = []
-        left_out: list[str] = []
-
-        def stage(name: str, reason_against: str | None) -> None:
-            runs.append(name) if reason_against is None else left_out.append(f"{name} ({reason_against})")
-
-        none_moves = None if dynamic else "no dynamic body"
-        stage("free motion", none_moves)
-        stage("kinematic motion", None if kinematic else "no kinematic body")
-        nothing_moves = None if self._node_count else none_moves
-        stage("ground contact", nothing_moves if self._packed.has_ground else "no ground")
-        stage("body-body contact", none_moves or (None if n > 1 else "one body"))
-        stage("friction", "not in this version")
-        stage("restitution", "not in this version")
-        no_cloth = None if self._node_count else "no cloth"
-        stage("cloth", no_cloth)
-        stage("cloth contact", no_cloth)
-        return runs, left_out
+            warn_of_failure(text)
 
 
 def _checked_iterations(count: int | None, coupling: str) -> int | None:
@@ -507,82 +368,3 @@ def _checked_iterations(count: int | None, coupling: str) -> int | None:
             ' of coupling="split" can be cut short, contact needs a converged one'
         )
     return count
-
-
-def _unwrapped_values(tensor: Tensor) -> np.ndarray:
-    """What torch.func's transforms have wrapped: all values, mapped axes of vmap among the axes."""
-    while torch._C._functorch.is_functorch_wrapped_tensor(tensor):
-        tensor = torch._C._functorch.get_unwrapped(tensor)
-    with torch._C._DisableFuncTorch():  # or they would wrap what is done here, too
-        return tensor.numpy(force=True)
-
-
-def _result(outputs: tuple[Tensor | None, ...], state: State) -> State:
-    """The operator's outputs as a state of the given state's dtype; without cloth, with the given state's empty one."""
-    if state.position.dtype is not torch.float64:
-        dtype = state.position.dtype
-        outputs = tuple(None if t is None else t.to(dtype) for t in outputs)
-    position, orientation, velocity, angular_velocity, node_position, node_velocity = outputs
-    assert position is not None  # bodies always are, if only none of them
-    if node_position is None or node_velocity is None:
-        node_position, node_velocity = state.node_position, state.node_velocity
-    if node_position.ndim != position.ndim or node_position.shape[:-2] != position.shape[:-2]:
-        leading = position.shape[:-2]
-        node_position = node_position.expand(*leading, *node_position.shape[-2:])
-        node_velocity = node_velocity.expand(*leading, *node_velocity.shape[-2:])
-    return State._make(
-        position=position,
-        orientation=orientation,
-        velocity=velocity,
-        angular_velocity=angular_velocity,
-        node_position=node_position,
-        node_velocity=node_velocity,
-    )
-
-
-def _combined(segments: list[Any]) -> Info:
-    """The statistics of a call from those of its segments."""
-    last = segments[-1]
-    return Info(
-        converged=all(segment.converged for segment in segments),
-        failed_steps=sum(segment.failed_steps for segment in segments),
-        fast_impacts=sum(segment.fast_impacts for segment in segments),
-        failure=next((segment.failure for segment in segments if not segment.converged), ""),
-        contacts=last.contacts,
-        zones=last.zones,
-        largest_zone=last.largest_zone,
-        iterations=last.iterations,
-        residual=last.residual,
-        max_compression=last.max_compression,
-        milliseconds=dict(last.milliseconds),
-    )
-
-
-def _frames_to_user() -> int:
-    """How far up the stack, seen from the caller, the first frame outside of diffsim and torch is."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in ("diffsim", "torch"):
-        level, frame = level + 1, frame.f_back
-    return level
-
-
-@contextmanager
-def _progress_bar(steps: int, shown: bool) -> Iterator[Callable[[int], object]]:
-    if not shown:
-        yield lambda count: None
-        return
-    try:
-        from tqdm.auto import tqdm
-    except ImportError:
-        done = 0
-
-        def advance(count: int) -> None:
-            nonlocal done
-            done += count
-            sys.stderr.write(f"\rrollout: step {done} of {steps}" + ("\n" if done == steps else ""))
-            sys.stderr.flush()
-
-        yield advance
-        return
-    with tqdm(total=steps, desc="rollout", unit="step") as bar:
-        yield bar.update

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 import diffsim as ds
-from diffsim import simulator
+from diffsim import _outcome
 
 
 @pytest.fixture
@@ -391,7 +391,7 @@ def test_a_mend_is_known_for_every_failure_of_the_core() -> None:
     source = Path(__file__).parents[2] / "csrc" / "bindings" / "bind_rollout.cpp"
     function = re.search(r"failure_text\(.*?^}", source.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     assert function is not None
-    assert set(re.findall(r'return "(.+)";', function[0])) == set(simulator._MENDS)
+    assert set(re.findall(r'return "(.+)";', function[0])) == set(_outcome.MENDS)
 
 
 # ---- description -----------------------------------------------------------------------------------------------------
