@@ -195,7 +195,7 @@ Mat6 mass_matrix(const ZoneBody& body) {
     return mass;
 }
 
-/// Inertia and, exactly, elasticity of the cloths' free nodes.
+/// Inertia and elasticity of the cloths' free nodes.
 MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free, CutShare cut) {
     const Eigen::Index first = 6 * zone.dynamic_count, size = free.size() - first;
     MatrixX matrix = MatrixX::Zero(size, size);
@@ -222,9 +222,22 @@ MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordin
     return matrix;
 }
 
-/// [ A  Jᵀ ; J  -1/stiffness ] [z; λ] = [v; 0], A inertia and elasticity.
-/// [Qiao et al. 2020, Eq. 9, its constraint rows softened]
-Coordinates solve_dense(
+/// With the exact elastic Hessian, or its projection where the exact one is not positive definite.
+MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free) {
+    MatrixX cloth = cloth_matrix(zone, point, free, kNothingCut);
+    if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success)
+        cloth = cloth_matrix(zone, point, free, kAllCut);
+    return cloth;
+}
+
+/// Of [ A  Jᵀ ; J  -1/stiffness ] [z; λ] = [v; 0], A inertia and elasticity [Qiao et al. 2020, Eq. 9, its constraint rows
+/// softened]. λ is stiffness J z, but computed from that it would lose the digits by which J z is smaller than z.
+struct KktSolution {
+    Coordinates z;
+    VectorX multipliers;
+};
+
+KktSolution solve_dense(
     const Zone& zone, const FreeCoordinates& free, const MatrixX& cloth, const Rows& rows,
     const Coordinates& upstream) {
     const Eigen::Index n = rows.J.cols(), m = rows.J.rows();
@@ -236,7 +249,8 @@ Coordinates solve_dense(
     for (Eigen::Index k = 0; k < m; ++k) kkt(n + k, n + k) = -1.0 / rows.stiffness[k];
     VectorX rhs = VectorX::Zero(n + m);
     rhs.head(n) = free.flatten(upstream);
-    return free.unflatten(kkt.partialPivLu().solve(rhs).head(n));
+    const VectorX solution = kkt.partialPivLu().solve(rhs);
+    return {free.unflatten(solution.head(n)), solution.tail(m)};
 }
 
 /// Cholesky factor of inertia and elasticity: 6x6 per body, one of all nodes.
@@ -272,26 +286,31 @@ private:
     Eigen::LLT<MatrixX> m_cloth;
 };
 
-/// With B = stiffness^½ J L⁻ᵀ and Bᵀ P = Q R:  (I + Bᵀ B)⁻¹ = I - Q (I - (I + R Rᵀ)⁻¹) Qᵀ, whatever the rank of B.
-Coordinates solve_qr(
+/// With B = stiffness^½ J L⁻ᵀ and Bᵀ P = Q R:  (I + Bᵀ B)⁻¹ = I - Q (I - (I + R Rᵀ)⁻¹) Qᵀ, whatever the rank of B, and
+/// B (I + Bᵀ B)⁻¹ = P Rᵀ (I + R Rᵀ)⁻¹ Qᵀ.
+KktSolution solve_qr(
     const FreeCoordinates& free, const InertiaFactor& factor, const Rows& rows, const Coordinates& upstream) {
     const Eigen::Index n = rows.J.cols(), m = rows.J.rows();
     VectorX v = free.flatten(upstream);
     factor.solve_lower(v);
+    VectorX multipliers(m);
     if (m > 0) {
-        MatrixX Bt = rows.J.transpose() * rows.stiffness.cwiseSqrt().asDiagonal();
+        const VectorX root = rows.stiffness.cwiseSqrt();
+        MatrixX Bt = rows.J.transpose() * root.asDiagonal();
         factor.solve_lower(Bt);
         const Eigen::ColPivHouseholderQR<MatrixX> qr(Bt);
         const Eigen::Index rank = std::min(n, m);
         const MatrixX R = qr.matrixR().topRows(rank).template triangularView<Eigen::Upper>();
-        VectorX projected = (qr.householderQ().transpose() * v).head(rank);
+        const VectorX projected = (qr.householderQ().transpose() * v).head(rank);
         const MatrixX gram = MatrixX::Identity(rank, rank) + R * R.transpose();
+        const VectorX kept = gram.llt().solve(projected);
         VectorX correction = VectorX::Zero(n);
-        correction.head(rank) = projected - gram.llt().solve(projected);
+        correction.head(rank) = projected - kept;
         v -= qr.householderQ() * correction;
+        multipliers = root.cwiseProduct(qr.colsPermutation() * (R.transpose() * kept));
     }
     factor.solve_upper(v);
-    return free.unflatten(v);
+    return {free.unflatten(v), multipliers};
 }
 
 /// Hard contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
@@ -358,20 +377,26 @@ std::vector<double> solve(
 }
 
 /// What contacts add to the gradients: `twist` times their second derivatives, and their reactions if they are hard.
+/// `multipliers`: stiffness times what opens each contact along `twist`, where contacts are rows of constant direction;
+/// null where they have curvature.
 void add_contacts(
-    const Zone& zone, const ZonePoint& point, bool with_curvature, const GradientNeeds& needs,
+    const Zone& zone, const ZonePoint& point, const VectorX* multipliers, const GradientNeeds& needs,
     const std::vector<Vec6>& twist, const std::vector<double>& reactions, ZoneAdjoint& result) {
     const ContactTermMaker make_term(zone, point);
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
-        const ContactTerm term = make_term(active, with_curvature && needs.place);
+        const ContactTerm term = make_term(active, multipliers == nullptr && needs.place);
         SmallVector motion = SmallVector::Zero(term.row.size());
         term.for_each(
             [&](int body, int offset) { motion.segment<6>(offset) = twist[body]; },
             [&](int node, int offset) { motion.segment<3>(offset) = result.multiplier.nodes[node]; });
         if (needs.place) {
-            SmallVector gradient = term.hessian.lazyProduct(motion);  // of this size a library call is slower
+            SmallVector gradient;
+            if (multipliers == nullptr)
+                gradient = term.hessian.lazyProduct(motion);  // of this size a library call is slower
+            else
+                gradient = (*multipliers)[static_cast<Eigen::Index>(k)] * term.row;
             if (zone.hard) gradient += reactions[k] * term.row;
             term.for_each(
                 [&](int body, int offset) { result.place_gradient.bodies[body] -= gradient.segment<6>(offset); },
@@ -424,6 +449,7 @@ const ZoneAdjoint& zone_adjoint(
     for (int i = 0; i < zone.node_count(); ++i)
         if (zone.nodes[i].pinned) result.multiplier.nodes[i].setZero();
     std::vector<double> reactions;
+    VectorX multipliers;
     if (exact) {
         system.set_pattern(base_pattern(zone));
         differentiate(zone, point, Curvature::full, derivatives, &system);
@@ -436,15 +462,19 @@ const ZoneAdjoint& zone_adjoint(
     } else {
         const FreeCoordinates free(zone);
         const Rows rows = collect_rows(zone, point, free);
-        MatrixX cloth = cloth_matrix(zone, point, free, kNothingCut);
-        if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success) cloth = cloth_matrix(zone, point, free, kAllCut);
+        const MatrixX cloth = cloth_matrix(zone, point, free);
+        const auto solve_by = [&](const auto& solve_kkt) {
+            reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) {
+                KktSolution solution = solve_kkt(z);
+                z = std::move(solution.z);
+                multipliers = std::move(solution.multipliers);
+            });
+        };
         if (mode == AdjointMode::dense) {
-            reactions = solve(
-                zone, point, result.multiplier, [&](Coordinates& z) { z = solve_dense(zone, free, cloth, rows, z); });
+            solve_by([&](const Coordinates& v) { return solve_dense(zone, free, cloth, rows, v); });
         } else {
             const InertiaFactor factor(zone, cloth);
-            reactions =
-                solve(zone, point, result.multiplier, [&](Coordinates& z) { z = solve_qr(free, factor, rows, z); });
+            solve_by([&](const Coordinates& v) { return solve_qr(free, factor, rows, v); });
         }
     }
 
@@ -458,7 +488,8 @@ const ZoneAdjoint& zone_adjoint(
         twist[i] = result.multiplier.bodies[i];
         twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();
     }
-    if (needs.place || needs.mass) add_contacts(zone, point, exact, needs, twist, reactions, result);
+    if (needs.place || needs.mass)
+        add_contacts(zone, point, exact ? nullptr : &multipliers, needs, twist, reactions, result);
     if (!zone.cloths.empty() && zone.elastic) add_elasticity(zone, point, needs, result);
     if (exact) {
         // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.

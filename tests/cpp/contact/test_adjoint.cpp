@@ -214,6 +214,26 @@ TEST(dense_and_qr_solve_the_same_system_on_turned_coordinates) {
     check_same_system(zone, point);
 }
 
+// What contacts do to the place gradient is stiffness J z, and J z is smaller than z by the compliance.
+TEST(stiff_contacts_cost_dense_and_qr_no_digits) {
+    for (const double compliance : {1e-4, 1e-6, 1e-8}) {
+        NOTE(compliance);
+        Scene scene = stack();
+        scene.compliance = compliance;
+        ZonePoint point;
+        const Zone zone = scene.solve(point);
+        CHECK(point.active.size() >= 16);
+        const Coordinates upstream = random_upstream(zone, 4);
+        const auto place_gradient = [&](AdjointMode mode) {
+            AdjointWorkspace workspace;
+            return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).place_gradient);
+        };
+        const VectorX by_lu = place_gradient(AdjointMode::dense), by_qr = place_gradient(AdjointMode::qr);
+        CHECK(by_lu.norm() > 0.1);
+        CHECK_NEAR(by_qr, by_lu, 1e-12 * by_lu.norm());
+    }
+}
+
 TEST(dense_and_qr_do_without_contacts) {
     ZonePoint point;
     const Scene scene = stack();
