@@ -483,4 +483,13 @@ void rollout_backward(
     for (int scene = 0; scene < tape.shape.batch; ++scene) write_gradient(tape, inputs, gradient, scene, scenes[scene]);
 }
 
+std::vector<LinearisedZone> linearised_zones(const Tape& tape, const RolloutInputs& inputs, int scene) {
+    const Model& model = *tape.model;
+    const StepRecord& record = tape.records[scene].back();
+    Workers workers(1);
+    SceneControl control;
+    read_control(model, inputs, tape.shape.steps - 1, scene, record.start, workers, control);
+    return linearised_zones(model, tape.options, read_parameters(model, inputs, scene), control, record);
+}
+
 }  // namespace diffsim

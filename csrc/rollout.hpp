@@ -79,4 +79,7 @@ void rollout_backward(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
     const RolloutArrays<double>& gradient, int thread_count);
 
+/// The linear systems of adjoint modes dense and qr in the last step of a scene. `inputs` are those of the forward.
+std::vector<LinearisedZone> linearised_zones(const Tape& tape, const RolloutInputs& inputs, int scene);
+
 }  // namespace diffsim

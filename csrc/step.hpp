@@ -116,4 +116,9 @@ void step_backward(
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient);
 
+/// The linear systems of adjoint modes dense and qr, one per zone of a step.
+std::vector<LinearisedZone> linearised_zones(
+    const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
+    const StepRecord& record);
+
 }  // namespace diffsim

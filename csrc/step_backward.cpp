@@ -3,19 +3,14 @@
 #include <Eigen/LU>
 #include <algorithm>
 
-#include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
+#include "recorded_zones.hpp"
 
 namespace diffsim {
 namespace {
 
 constexpr int kWorthSharing = 64;       // bodies and nodes in zones: fewer are done before a thread has woken up
 constexpr int kPortionsPerThread = 32;  // of the zones: they take differently long
-
-/// Where a zone's bodies, cloths and contacts begin or end in the record.
-struct ZoneRange {
-    int body = 0, cloth = 0, contact = 0;
-};
 
 /// What a zone gives a body that it shares with others.
 struct SharedGradient {
@@ -25,7 +20,7 @@ struct SharedGradient {
 
 /// What one thread needs beside a zone's memory.
 struct alignas(64) BackwardLane {  // of cache lines of its own
-    std::vector<int> local;        ///< index in the zone at hand, by object; -1 if it is not in it
+    std::vector<int> local;        ///< see RecordedZones::rebuild
     Coordinates upstream;
     AdjointWorkspace adjoint, elastic;  ///< of the zone; of split coupling's elastic pass
     std::vector<SharedGradient> shared;
@@ -34,8 +29,7 @@ struct alignas(64) BackwardLane {  // of cache lines of its own
 }  // namespace
 
 struct StepWorkspace::BackwardScratch {
-    std::vector<ZoneRange> zone_first;  ///< and behind the last zone's the end
-    std::vector<Vec6> pose_gradient;    ///< along the twist of the body at the end of the step
+    std::vector<Vec6> pose_gradient;  ///< along the twist of the body at the end of the step
     std::vector<Vec6> multiplier;
     std::vector<char> in_zone;
     std::vector<BackwardLane> lanes;  ///< one per thread
@@ -56,6 +50,7 @@ public:
           m_parameters(parameters),
           m_control(control),
           m_record(record),
+          m_zones(model, options, parameters, control, record),
           m_needs(needs),
           m_workspace(workspace),
           m(*workspace.backward),
@@ -91,12 +86,8 @@ private:
     Vec3 node_upstream(int i) const { return m_gradient.node_position[i] + m_gradient.node_velocity[i] / m_options.dt; }
 
     void solve_zones() {
-        m.zone_first.assign(1, ZoneRange{});
-        for (std::size_t k = 0; k < m_record.zones.body_end.size(); ++k)
-            m.zone_first.push_back(
-                {m_record.zones.body_end[k], m_record.zones.cloth_end[k], m_record.zones.contact_end[k]});
         // Threads write to the zones' own bodies and cloths. What zones share is added up after, in the zones' order.
-        const int count = static_cast<int>(m.zone_first.size()) - 1;
+        const int count = m_zones.count();
         const bool worth_it = !m_record.zones.cloths.empty() || m_record.zones.bodies.size() >= kWorthSharing;
         const int portions = worth_it ? kPortionsPerThread * m_workspace.workers.thread_count() : 1;
         m_workspace.workers.for_each_range(count, std::max(count / portions, 1), [&](int begin, int end, int thread) {
@@ -138,111 +129,20 @@ private:
         m_parameter_gradient.gravity += m_options.dt * sum;
     }
 
-    /// The memory's zone, with the bodies and cloths of the record that yield.
-    void rebuild_zone(const ZoneRange& first, const ZoneRange& end, ZoneMemory& memory, BackwardLane& lane) {
-        Zone& zone = memory.zone;
-        clear(zone);
-        zone.model = &m_model;
-        set_compliance(zone, m_options.compliance);
-        zone.dt = m_options.dt;
-        zone.cloth_parameters = &m_parameters.cloths;
-        zone.elastic = !m_options.split;
-        zone.contacts_off = false;
-        zone.origin = first.body < end.body
-                          ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
-                          : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
-        zone.ground_height = m_model.ground.height - zone.origin.z();
-        memory.workspace.point.y.resize(0, 0);
-        for (int b = first.body; b < end.body; ++b) join_body(memory, lane, m_record.zones.bodies[b]);
-        zone.dynamic_count = end.body - first.body;
-        for (int c = first.cloth; c < end.cloth; ++c) join_cloth(memory, lane, m_record.zones.cloths[c]);
-    }
-
-    void join_body(ZoneMemory& memory, BackwardLane& lane, int id) const {
-        const BodyState& state = m_record.start.bodies[id];
-        ZoneBody body;
-        body.id = id;
-        if (m_model.bodies[id].is_dynamic())
-            body = moving_body(id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
-        else
-            body.start = {quaternion_to_matrix(state.orientation), state.position};
-        body.start.t -= memory.zone.origin;
-        lane.local[id] = static_cast<int>(memory.zone.bodies.size());
-        memory.zone.bodies.push_back(body);
-        memory.workspace.point.y.bodies.push_back(m_record.y.bodies[id]);
-    }
-
-    void join_cloth(ZoneMemory& memory, BackwardLane& lane, int id) const {
-        const Cloth& cloth = m_model.cloths[id];
-        Zone& zone = memory.zone;
-        lane.local[m_model.body_count() + id] = static_cast<int>(zone.cloths.size());
-        add_cloth(zone, id, m_record.start, m_control, m_parameters);
-        const int first = zone.cloths.back().first_node;
-        for (int k = 0; k < cloth.node_count(); ++k) {
-            memory.workspace.point.y.nodes.push_back(m_record.y.nodes[cloth.first_node + k]);
-            if (m_options.split) zone.nodes[first + k].target = m_record.elastic_shift[cloth.first_node + k];
-        }
-    }
-
-    void list_contacts(const ZoneRange& first, const ZoneRange& end, ZoneMemory& memory, BackwardLane& lane) const {
-        Zone& zone = memory.zone;
-        for (int c = first.contact; c < end.contact; ++c) {
-            const Contact& contact = m_record.zones.contacts[c];
-            for (int object : {contact.object_a, contact.object_b})
-                if (object >= 0 && lane.local[object] < 0) join_body(memory, lane, object);  // one that does not yield
-        }
-        const auto object_of = [&](int object) {
-            if (object == kGround) return ZoneObject{kGround, -1};
-            return m_model.is_cloth(object) ? ZoneObject{kNobody, lane.local[object]}
-                                            : ZoneObject{lane.local[object], -1};
-        };
-        for (int c = first.contact; c < end.contact; ++c) {
-            const Contact& contact = m_record.zones.contacts[c];
-            add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
-            ZoneContact& entry = zone.contacts.back();
-            if (zone.hard) {
-                entry.shift = m_record.zones.shifts[c];
-                entry.range.rest += entry.shift;
-            }
-            if (zone.yields(entry.a) && zone.yields(entry.b))
-                zone.pairs.emplace_back(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
-        }
-        std::sort(zone.pairs.begin(), zone.pairs.end());
-        zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());
-        for (ZoneContact& entry : zone.contacts) {
-            if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
-            const std::pair<int, int> key(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
-            entry.pair =
-                static_cast<int>(std::lower_bound(zone.pairs.begin(), zone.pairs.end(), key) - zone.pairs.begin());
-        }
-    }
-
     void solve_zone_adjoint(int index, int thread) {
-        const ZoneRange &first = m.zone_first[index], &end = m.zone_first[index + 1];
         ZoneMemory& memory = m_workspace.zones[thread];
         BackwardLane& lane = m.lanes[thread];
-        lane.local.resize(m_model.bodies.size() + m_model.cloths.size(), -1);
-        rebuild_zone(first, end, memory, lane);
-        list_contacts(first, end, memory, lane);
-        Zone& zone = memory.zone;
-        ZonePoint& point = memory.workspace.point;
-        evaluate(zone, point);
-        bool below_floor = false;
-        for (std::size_t k = 0; k < zone.contacts.size(); ++k)
-            below_floor = below_floor || point.distances[k] < zone.contacts[k].range.floor;
-        if (below_floor) {
-            rescue_contacts(zone);
-            evaluate(zone, point);
-        }
+        m_zones.rebuild(index, memory, lane.local);
+        const Zone& zone = memory.zone;
+        const ZonePoint& point = memory.workspace.point;
         lane.upstream.resize(0, 0);
-        for (int b = first.body; b < end.body; ++b) lane.upstream.bodies.push_back(upstream(m_record.zones.bodies[b]));
+        for (int k = 0; k < zone.dynamic_count; ++k) lane.upstream.bodies.push_back(upstream(zone.bodies[k].id));
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 lane.upstream.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
         const ZoneAdjoint& adjoint = zone_adjoint(zone, point, lane.upstream, m_options.adjoint, m_needs, lane.adjoint);
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
-            lane.local[id] = -1;
             if (k >= zone.dynamic_count) {
                 lane.shared.push_back({index, id, adjoint.place_gradient.bodies[k]});
                 continue;
@@ -252,7 +152,6 @@ private:
             m_parameter_gradient.mass[id] += adjoint.mass_gradient[k];
         }
         if (zone.cloths.empty()) return;
-        for (const ZoneCloth& cloth : zone.cloths) lane.local[m_model.body_count() + cloth.id] = -1;
         if (m_options.split)
             split_cloths(zone, adjoint, lane.elastic);
         else
@@ -424,6 +323,7 @@ private:
     const Parameters& m_parameters;
     const SceneControl& m_control;
     const StepRecord& m_record;
+    const RecordedZones m_zones;
     const GradientNeeds& m_needs;
     StepWorkspace& m_workspace;
     StepWorkspace::BackwardScratch& m;

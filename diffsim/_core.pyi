@@ -135,6 +135,11 @@ def rollout_backward(
     needs: Sequence[bool],
     num_threads: int,
 ) -> tuple[NDArray[np.float64] | None, ...]: ...
+def contact_systems(
+    tape: Tape, inputs: list[NDArray[np.float64] | None]
+) -> tuple[
+    tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], ...
+]: ...
 def separate(
     model: Model,
     options: Options,

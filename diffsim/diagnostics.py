@@ -1,4 +1,4 @@
-"""Checks a user can run on a scene of their own: are the gradients right?"""
+"""What a user can look at in a scene of their own: are the gradients right, and what system do they solve?"""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from . import _core
 from ._check import (
     CLOTH_PARAMETERS,
     CONTROL_FIELDS,
@@ -25,7 +26,7 @@ from ._inputs import Controls, over_time
 from .simulator import Simulator
 from .state import Control, State
 
-__all__ = ["DirectionCheck", "GradcheckReport", "gradcheck"]
+__all__ = ["ContactSystem", "DirectionCheck", "GradcheckReport", "contact_systems", "gradcheck"]
 
 # A control that has the name of a field of the state is called otherwise here.
 _CONTROL_NAMES = {name: {"node_velocity": "node_drive"}.get(name, name) for name in CONTROL_FIELDS}
@@ -199,6 +200,64 @@ def gradcheck(
         checks.append(DirectionCheck(name, derivative, difference, error, changed))
     zero = tuple(name for name, grad in zip(names, grads) if not grad.any())
     return GradcheckReport(tuple(checks), zero, steps, eps, median_tolerance, max_tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSystem:
+    """What ``adjoint="dense"`` and ``"qr"`` solve for objects in contact with each other: (A + Jᵀ K J) z = v.
+
+    It is the KKT system of Eq. 9 of Qiao et al. (ICML 2020), [A Jᵀ; J -1/K] [z; λ] = [v; 0], with the compliance of the
+    contacts as its lower right block (with 0 in its place the contacts are hard). v is d(loss)/d(motion of the step),
+    and A z is what of it reaches the motion without contact; so d(loss)/d(force) is dt² times z of the shift.
+
+    Its n coordinates, in world axes: of each of `bodies` how far it turns [rad] and shifts [m], of each of `nodes` its
+    shift [m].
+    """
+
+    bodies: NDArray[np.int64]  #: dynamic bodies, indices into the body axis
+    nodes: NDArray[np.int64]  #: cloth nodes that are not pinned, indices into the node axis
+    inertia: NDArray[np.float64]  #: A (n, n): inertia [kg·m², kg]; of nodes, dt² times elastic stiffness, too [kg]
+    jacobian: NDArray[np.float64]  #: J (m, n): d(distance)/d(coordinates) of the m active contacts [m/rad, 1]
+    stiffness: NDArray[np.float64]  #: K (m,): of the contacts, times dt² [kg]
+
+
+def contact_systems(sim: Simulator, state: State, control: Control | None = None) -> tuple[ContactSystem, ...]:
+    """The linear systems that ``adjoint="dense"`` and ``"qr"`` solve in the backward of one step, one per zone.
+
+    For looking at what contacts do to a gradient: how many rows of J depend on each other, how badly conditioned the
+    system is, how well a solver of one's own does. "exact" adds the contacts' curvature to it.
+
+    Args:
+        sim: Any simulator, whatever its `adjoint`. With ``compliance=0`` the stiffness is that of the steps by which
+            the hard contacts' reactions are found; with ``coupling="split"`` the systems are those of the contact pass.
+        state: Where the step starts, without batch axis.
+        control: Of the step, without batch axis.
+    Returns: One system per group of bodies and cloths in contact and per cloth that touches nothing, in the order of
+        their first objects; none for a body that touches nothing. The matrices are dense: memory grows with the square
+        of a group's size.
+    Raises: TypeError, ValueError as the step does, and for a batch.
+    Gradients: none.
+    """
+    where = "contact_systems"
+    check_instance(where, "sim", sim, Simulator, "be a diffsim.Simulator")
+    with torch.no_grad():
+        inputs, _ = sim._checked_inputs(where, state, control, None)
+        arrays = [None if t is None else t.contiguous().numpy(force=True) for t in inputs]
+    if state.leading_shape or any(t is not None and t.ndim > 2 for t in inputs[6:12]):
+        raise ValueError(f"{where}: state and control must have no batch axis")
+    result = _core.rollout(
+        sim._model,
+        sim._options,
+        arrays,
+        steps=1,
+        controls_have_time=False,
+        keep_time=False,
+        record=True,
+        num_threads=1,
+        first_step=0,
+    )
+    assert result.tape is not None  # it was recorded
+    return tuple(ContactSystem(*system) for system in _core.contact_systems(result.tape, arrays))
 
 
 def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps: int) -> dict[str, Tensor]:

@@ -256,6 +256,30 @@ py::tuple bound_backward(
     return result;
 }
 
+template <typename Matrix>
+Array array_of(const Matrix& matrix) {
+    Array out(Shape{matrix.rows(), matrix.cols()});
+    Eigen::Map<Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>>(
+        out.mutable_data(), matrix.rows(), matrix.cols()) = matrix;
+    return out;
+}
+
+py::tuple bound_contact_systems(const std::shared_ptr<Tape>& tape, const InputArrays& inputs) {
+    const Fields fields = input_fields(*tape->model);
+    const Leading leading = find_leading(inputs, fields, tape->shape.steps, tape->shape.controls_have_time);
+    if (leading.batch != 1 || tape->shape.batch != 1)
+        throw std::invalid_argument("contact_systems: there must be one scene");
+    const std::vector<LinearisedZone> zones = linearised_zones(*tape, views_of(inputs, fields, leading), 0);
+    py::tuple result(zones.size());
+    for (std::size_t k = 0; k < zones.size(); ++k) {
+        const LinearisedZone& zone = zones[k];
+        const py::array_t<std::int64_t> bodies = py::cast(zone.bodies), nodes = py::cast(zone.nodes);
+        const Array stiffness(static_cast<py::ssize_t>(zone.stiffness.size()), zone.stiffness.data());
+        result[k] = py::make_tuple(bodies, nodes, array_of(zone.inertia), array_of(zone.J), stiffness);
+    }
+    return result;
+}
+
 SceneState scene_state(
     const Model& model, const Array& position, const Array& orientation, const Array& node_position) {
     const py::ssize_t n = model.body_count(), nodes = model.node_count();
@@ -377,6 +401,11 @@ void bind_rollout(py::module_& module) {
     module.def(
         "rollout_backward", &bound_backward, py::arg("tape"), py::arg("inputs").noconvert(),
         py::arg("upstream").noconvert(), py::kw_only(), py::arg("needs"), py::arg("num_threads"));
+
+    module.def(
+        "contact_systems", &bound_contact_systems, py::arg("tape"), py::arg("inputs").noconvert(),
+        "What adjoint modes dense and qr solve in the last step, one per zone: (bodies, nodes, inertia, jacobian, "
+        "stiffness).");
 
     module.def(
         "separate", &bound_separate, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),

@@ -437,6 +437,27 @@ void add_elasticity(const Zone& zone, const ZonePoint& point, const GradientNeed
 
 }  // namespace
 
+LinearisedZone linearise(const Zone& zone, const ZonePoint& point) {
+    const FreeCoordinates free(zone);
+    Rows rows = collect_rows(zone, point, free);
+    LinearisedZone result;
+    result.inertia = MatrixX::Zero(free.size(), free.size());
+    for (int i = 0; i < zone.dynamic_count; ++i) {
+        result.bodies.push_back(zone.bodies[i].id);
+        result.inertia.block<6, 6>(6 * i, 6 * i) = mass_matrix(zone.bodies[i]);
+    }
+    for (const ZoneCloth& part : zone.cloths) {
+        const Cloth& cloth = zone.model->cloths[part.id];
+        for (int k = 0; k < cloth.node_count(); ++k)
+            if (free.row(part.first_node + k) >= 0) result.nodes.push_back(cloth.first_node + k);
+    }
+    const MatrixX cloth = cloth_matrix(zone, point, free);
+    result.inertia.bottomRightCorner(cloth.rows(), cloth.cols()) = cloth;
+    result.J = std::move(rows.J);
+    result.stiffness = std::move(rows.stiffness);
+    return result;
+}
+
 const ZoneAdjoint& zone_adjoint(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
     AdjointWorkspace& workspace) {

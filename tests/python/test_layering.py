@@ -21,6 +21,7 @@ ROOMS = {
     "rollout": ["scene_queries"],
     "bindings": ["rollout", "scene_queries"],
 }
+STEP_FILES = ("step", "step_backward", "recorded_zones")  # of one room
 PYTHON_ROOM = "bindings"  # the only one that sees Python
 
 INCLUDE = re.compile(r'^\s*#\s*include\s*([<"])([^>"]+)[>"]', re.MULTILINE)
@@ -32,8 +33,9 @@ def reachable_rooms(room: str) -> set[str]:
 
 
 def room_of(path: Path, csrc: Path) -> str:
-    """The first folder, or for a file directly in csrc its name; step.cpp and step_backward.cpp are both room step."""
-    return Path(path.relative_to(csrc).parts[0]).stem.removesuffix("_backward")
+    """The first folder, or for a file directly in csrc its name, or what STEP_FILES say."""
+    name = Path(path.relative_to(csrc).parts[0]).stem
+    return "step" if name in STEP_FILES else name
 
 
 def violations(csrc: Path) -> list[str]:

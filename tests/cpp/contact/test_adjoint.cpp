@@ -166,6 +166,15 @@ Coordinates without_pinned(const Zone& zone, Coordinates y) {
     return y;
 }
 
+/// The coordinates of bodies and of nodes that are not pinned.
+VectorX free_part(const Zone& zone, const VectorX& y) {
+    const Eigen::Index bodies = 6 * zone.dynamic_count;
+    std::vector<double> kept(y.data(), y.data() + bodies);
+    for (int i = 0; i < zone.node_count(); ++i)
+        if (!zone.nodes[i].pinned) kept.insert(kept.end(), y.data() + bodies + 3 * i, y.data() + bodies + 3 * i + 3);
+    return Eigen::Map<const VectorX>(kept.data(), static_cast<Eigen::Index>(kept.size()));
+}
+
 VectorX multiplier(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode) {
     AdjointWorkspace workspace;
     return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).multiplier);
@@ -184,6 +193,11 @@ void check_same_system(const Zone& zone, const ZonePoint& point) {
         CHECK(by_lu.norm() > 0.0);
         CHECK_NEAR(by_qr, by_lu, kSameSystem * by_lu.norm());
         CHECK_NEAR(direct, by_lu, kSameSystem * by_lu.norm());
+        const LinearisedZone linear = linearise(zone, point);
+        const MatrixX condensed = linear.inertia + linear.J.transpose() * linear.stiffness.asDiagonal() * linear.J;
+        CHECK_NEAR(
+            free_part(zone, direct), condensed.llt().solve(free_part(zone, flatten(upstream))),
+            kSameSystem * by_lu.norm());
     }
 }
 

@@ -1,0 +1,128 @@
+#include "recorded_zones.hpp"
+
+#include <algorithm>
+
+#include "contact/zone_contacts.hpp"
+#include "math/rotation.hpp"
+
+namespace diffsim {
+
+RecordedZones::Range RecordedZones::end_of(int index) const {
+    if (index < 0) return {};
+    const TouchingZones& zones = m_record.zones;
+    return {zones.body_end[index], zones.cloth_end[index], zones.contact_end[index]};
+}
+
+void RecordedZones::rebuild(int index, ZoneMemory& memory, std::vector<int>& local) const {
+    const Range first = end_of(index - 1), end = end_of(index);
+    local.resize(m_model.bodies.size() + m_model.cloths.size(), -1);
+    add_objects(first, end, memory, local);
+    list_contacts(first, end, memory, local);
+    Zone& zone = memory.zone;
+    for (const ZoneBody& body : zone.bodies) local[body.id] = -1;
+    for (const ZoneCloth& cloth : zone.cloths) local[m_model.body_count() + cloth.id] = -1;
+    ZonePoint& point = memory.workspace.point;
+    evaluate(zone, point);
+    bool below_floor = false;
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k)
+        below_floor = below_floor || point.distances[k] < zone.contacts[k].range.floor;
+    if (below_floor) {
+        rescue_contacts(zone);
+        evaluate(zone, point);
+    }
+}
+
+/// The bodies and cloths that yield.
+void RecordedZones::add_objects(
+    const Range& first, const Range& end, ZoneMemory& memory, std::vector<int>& local) const {
+    Zone& zone = memory.zone;
+    clear(zone);
+    zone.model = &m_model;
+    set_compliance(zone, m_options.compliance);
+    zone.dt = m_options.dt;
+    zone.cloth_parameters = &m_parameters.cloths;
+    zone.elastic = !m_options.split;
+    zone.contacts_off = false;
+    zone.origin = first.body < end.body
+                      ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
+                      : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
+    zone.ground_height = m_model.ground.height - zone.origin.z();
+    memory.workspace.point.y.resize(0, 0);
+    for (int b = first.body; b < end.body; ++b) join_body(memory, local, m_record.zones.bodies[b]);
+    zone.dynamic_count = end.body - first.body;
+    for (int c = first.cloth; c < end.cloth; ++c) join_cloth(memory, local, m_record.zones.cloths[c]);
+}
+
+void RecordedZones::join_body(ZoneMemory& memory, std::vector<int>& local, int id) const {
+    const BodyState& state = m_record.start.bodies[id];
+    ZoneBody body;
+    body.id = id;
+    if (m_model.bodies[id].is_dynamic())
+        body = moving_body(id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
+    else
+        body.start = {quaternion_to_matrix(state.orientation), state.position};
+    body.start.t -= memory.zone.origin;
+    local[id] = static_cast<int>(memory.zone.bodies.size());
+    memory.zone.bodies.push_back(body);
+    memory.workspace.point.y.bodies.push_back(m_record.y.bodies[id]);
+}
+
+void RecordedZones::join_cloth(ZoneMemory& memory, std::vector<int>& local, int id) const {
+    const Cloth& cloth = m_model.cloths[id];
+    Zone& zone = memory.zone;
+    local[m_model.body_count() + id] = static_cast<int>(zone.cloths.size());
+    add_cloth(zone, id, m_record.start, m_control, m_parameters);
+    const int first = zone.cloths.back().first_node;
+    for (int k = 0; k < cloth.node_count(); ++k) {
+        memory.workspace.point.y.nodes.push_back(m_record.y.nodes[cloth.first_node + k]);
+        if (m_options.split) zone.nodes[first + k].target = m_record.elastic_shift[cloth.first_node + k];
+    }
+}
+
+void RecordedZones::list_contacts(
+    const Range& first, const Range& end, ZoneMemory& memory, std::vector<int>& local) const {
+    Zone& zone = memory.zone;
+    for (int c = first.contact; c < end.contact; ++c) {
+        const Contact& contact = m_record.zones.contacts[c];
+        for (int object : {contact.object_a, contact.object_b})
+            if (object >= 0 && local[object] < 0) join_body(memory, local, object);  // one that does not yield
+    }
+    const auto object_of = [&](int object) {
+        if (object == kGround) return ZoneObject{kGround, -1};
+        return m_model.is_cloth(object) ? ZoneObject{kNobody, local[object]} : ZoneObject{local[object], -1};
+    };
+    for (int c = first.contact; c < end.contact; ++c) {
+        const Contact& contact = m_record.zones.contacts[c];
+        add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
+        ZoneContact& entry = zone.contacts.back();
+        if (zone.hard) {
+            entry.shift = m_record.zones.shifts[c];
+            entry.range.rest += entry.shift;
+        }
+        if (zone.yields(entry.a) && zone.yields(entry.b))
+            zone.pairs.emplace_back(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
+    }
+    std::sort(zone.pairs.begin(), zone.pairs.end());
+    zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());
+    for (ZoneContact& entry : zone.contacts) {
+        if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
+        const std::pair<int, int> key(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
+        entry.pair = static_cast<int>(std::lower_bound(zone.pairs.begin(), zone.pairs.end(), key) - zone.pairs.begin());
+    }
+}
+
+std::vector<LinearisedZone> linearised_zones(
+    const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
+    const StepRecord& record) {
+    const RecordedZones zones(model, options, parameters, control, record);
+    ZoneMemory memory;
+    std::vector<int> local;
+    std::vector<LinearisedZone> result;
+    for (int k = 0; k < zones.count(); ++k) {
+        zones.rebuild(k, memory, local);
+        result.push_back(linearise(memory.zone, memory.workspace.point));
+    }
+    return result;
+}
+
+}  // namespace diffsim
