@@ -20,23 +20,41 @@ import torch
 from torch import Tensor
 
 import diffsim as ds
+from diffsim import _core
+from diffsim.ops import RolloutCall, rollout
 
 Result = TypeVar("Result")
 Clock = Callable[[], float]  # seconds
 
 
-def make_parser(description: str | None) -> argparse.ArgumentParser:
-    """With what every benchmark understands."""
+def make_parser(
+    description: str | None, *, rounds: int | None = None, plot: bool = False, cpu_time: bool = True
+) -> argparse.ArgumentParser:
+    """With what benchmarks understand: `rounds` is how many are timed by default.
+
+    Args:
+        description: The script's docstring.
+        rounds: Default of --rounds; None: the script has no rounds.
+        plot: Whether it draws one, into --out.
+        cpu_time: Whether its times may be those on the processor: not where several threads work.
+    """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a smoke run of a few seconds; its numbers mean nothing")
-    parser.add_argument(
-        "--cpu-time",
-        dest="clock",
-        action="store_const",
-        const=time.process_time,
-        default=time.perf_counter,
-        help="time on the processor instead of wall time: for machines that others use, too",
-    )
+    parser.set_defaults(clock=time.perf_counter)
+    if cpu_time:
+        parser.add_argument(
+            "--cpu-time",
+            dest="clock",
+            action="store_const",
+            const=time.process_time,
+            help="time on the processor instead of wall time: for machines that others use, too",
+        )
+    if rounds is not None:
+        parser.add_argument(
+            "--rounds", type=int, default=rounds, help="of which the medians are printed (default: %(default)s)"
+        )
+    if plot:
+        parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     return parser
 
 
@@ -73,6 +91,30 @@ def print_row(values: Iterable[object]) -> None:
     """One CSV line. None is an empty field: a peer has no figure there."""
     texts = (f"{value:.4g}" if isinstance(value, float) else value for value in values)
     print(*("" if text is None else text for text in texts), sep=",", flush=True)
+
+
+class Table:
+    """CSV with named columns: prints its heading at once and every row as it comes, and keeps the rows."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self.columns = columns
+        self.rows: list[dict[str, Any]] = []
+        print_row(columns)
+
+    def add(self, row: dict[str, Any]) -> None:
+        """What a row lacks is an empty field."""
+        self.rows.append(row)
+        print_row(row.get(name) for name in self.columns)
+
+    def curve(self, x: str, y: str, **those: object) -> tuple[list[float], list[float]]:
+        """Two columns, of the rows that have `those` values."""
+        rows = [row for row in self.rows if all(row[name] == value for name, value in those.items())]
+        return [row[x] for row in rows], [row[y] for row in rows]
+
+
+def print_slopes(curves: Mapping[str, tuple[list[float], list[float]]]) -> None:
+    """A comment line with the log-log slope of each."""
+    print("# log-log slopes:", ", ".join(f"{name} {slope(x, y):.3f}" for name, (x, y) in curves.items()))
 
 
 def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9.6, 3.8)) -> None:
@@ -117,6 +159,11 @@ def in_turns(
             call()
             seconds[name].append(clock() - start)
     return seconds
+
+
+def repeated(call: Callable[[], object], repeats: int) -> None:
+    for _ in range(repeats):
+        call()
 
 
 def median_ratio(numerator: list[float], denominator: list[float]) -> float:
@@ -182,6 +229,18 @@ class Recorded:
     def backward(self) -> tuple[Tensor, ...]:
         """The gradient with respect to the initial state and the masses; as often as wanted."""
         return torch.autograd.grad(self.loss, self.inputs, retain_graph=True)
+
+
+def tape_bytes(sim: ds.Simulator, start: ds.State, steps: int) -> int:
+    """What a rollout of bodies keeps for its backward; not public, so asked of the operator."""
+    call = RolloutCall(sim._model, sim._options, steps, 1, keep_time=True)
+    bodies = (start.position, start.orientation, start.velocity, start.angular_velocity)
+    no_cloth_nor_controls = (None,) * 8
+    with torch.enable_grad():
+        position = bodies[0].detach().requires_grad_()
+        rollout(call, position, *bodies[1:], *no_cloth_nor_controls, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
+    assert isinstance(call.tape, _core.Tape)
+    return call.tape.nbytes
 
 
 def differentiate(sim: ds.Simulator, start: ds.State, steps: int) -> tuple[Tensor, ...]:

@@ -86,15 +86,14 @@ def gap(gradient: Tensor, exact: Tensor) -> float:
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=21)
     parser.add_argument("--losses", type=int, default=16, help="random losses per scene (default: %(default)s)")
-    parser.add_argument("--rounds", type=int, default=21, help="of timing (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
         options.losses, options.rounds = 1, 1
     torch.set_num_threads(1)
     print_header(clock=options.clock)
-    print(",".join(COLUMNS))
+    print_row(COLUMNS)
     for name, build in SCENES.items():
         cases = {mode: Case(build, mode) for mode in MODES}
         gaps: dict[tuple[str, int], list[float]] = {(mode, k): [] for mode in MODES for k in (0, 1)}

@@ -10,16 +10,14 @@ backward, and their ratio. Should be at least 1.7 on two cores.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 
 import torch
-from _common import in_turns, median_ratio, print_header, print_row
+from _common import advance, in_turns, make_parser, median_ratio, print_header, print_row
 
 import diffsim as ds
 
@@ -49,11 +47,6 @@ def batch_of(sim: ds.Simulator, count: int, ragged: bool) -> ds.State:
     return state.replace(position=state.position + lift[:, None, None] * torch.tensor([0.0, 0.0, 1.0]).double())
 
 
-def forward(sim: ds.Simulator, state: ds.State, steps: int) -> None:
-    with torch.no_grad():
-        sim.rollout(state, None, steps)
-
-
 def gradient(sim: ds.Simulator, state: ds.State, steps: int) -> None:
     inputs = {name: getattr(state, name).detach().clone().requires_grad_() for name in FIELDS}
     final = sim.rollout(state.replace(**inputs), None, steps)[-1]
@@ -61,36 +54,33 @@ def gradient(sim: ds.Simulator, state: ds.State, steps: int) -> None:
 
 
 def one_by_one(
-    call: Callable[[ds.Simulator, ds.State, int], None], sim: ds.Simulator, scenes: list[ds.State], steps: int
+    call: Callable[[ds.Simulator, ds.State, int], object], sim: ds.Simulator, scenes: list[ds.State], steps: int
 ) -> None:
     for state in scenes:
         call(sim, state, steps)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, rounds=11, cpu_time=False)
     parser.add_argument("--scenes", type=int, default=64)
     parser.add_argument("--bodies", type=int, default=10)
     parser.add_argument("--steps", type=int, nargs="+", default=(1, 100), help="per call")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
-    parser.add_argument("--rounds", type=int, default=11, help="of which the medians are printed")
-    parser.add_argument("--quick", action="store_true", help="a few seconds: 3 rounds of 20 steps")
     options = parser.parse_args()
     if options.quick:
         options.rounds, options.steps = 3, (20,)
     torch.set_num_threads(1)
     sim = ds.Simulator(scene_of(options.bodies), dt=DT, num_threads=options.threads)
-    print_header(clock=time.perf_counter)
+    print_header(clock=options.clock)
     print_row(COLUMNS)
     for steps in options.steps:
         for case in ("even", "ragged"):
             batch = batch_of(sim, options.scenes, case == "ragged")
             if steps == 1:  # from states with contact, or none of the copies would have any
-                with torch.no_grad():
-                    batch = sim.rollout(batch, None, 30)[-1]
+                batch = advance(sim, batch, 30)[-1]
             scenes = [batch[k] for k in range(options.scenes)]
             calls: dict[str, Callable[[], object]] = {}
-            for name, call in (("forward", forward), ("gradient", gradient)):
+            for name, call in (("forward", advance), ("gradient", gradient)):
                 calls[f"loop {name}"] = partial(one_by_one, call, sim, scenes, steps)
                 calls[f"batch {name}"] = partial(call, sim, batch, steps)
             for warm in calls.values():

@@ -27,13 +27,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
-from _common import Clock, draw_curves, make_parser, print_header, print_row, save_plot, slope
+from _common import Clock, Table, draw_curves, make_parser, print_header, print_slopes, save_plot
 
 import diffsim as ds
 
@@ -310,12 +309,10 @@ def draw(rows: list[dict[str, Any]], figure: Any) -> None:
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=3, plot=True)
     parser.add_argument("--nodes", type=int, nargs="+", default=NODES, help="along a side")
-    parser.add_argument("--rounds", type=int, default=3, help="of which the medians are printed")
     parser.add_argument("--steps", type=int, default=40, help="of which the first nine or ten are flight")
     parser.add_argument("--no-peers", action="store_true", help="time diffsim alone")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
         options.nodes, options.rounds, options.steps = [11], 1, 14
@@ -329,19 +326,15 @@ def main() -> int:
             makers.append(Vbd)
         else:
             print("# without VBD:", why_not)
-    print_row(COLUMNS)
-    rows = []
+    table = Table(COLUMNS)
     for nodes in options.nodes:
         mesh = Mesh(nodes, Ours(nodes, options.steps), [make(nodes, options.steps) for make in makers])
         for _ in range(options.rounds):
             mesh.measure(options.clock)
-        rows.append(mesh.row())
-        print_row(rows[-1][name] for name in COLUMNS)
-    nodes_of_rows = [row["nodes"] for row in rows]
-    measured = [name for name in (*OWN, *OTHERS) if rows[0][name] is not None]
-    slopes = (f"{name} {slope(nodes_of_rows, [row[name] for row in rows]):.3f}" for name in measured)
-    print("# log-log slopes:", ", ".join(slopes))
-    save_plot(options.out / "cloth.png", partial(draw, rows), (12.0, 4.0))
+        table.add(mesh.row())
+    measured = [name for name in (*OWN, *OTHERS) if table.rows[0][name] is not None]
+    print_slopes({name: table.curve("nodes", name) for name in measured})
+    save_plot(options.out / "cloth.png", partial(draw, table.rows), (12.0, 4.0))
     return 0
 
 

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 import torch
 from _common import (
     Clock,
+    Table,
     added_memory,
     advance,
     differentiate,
@@ -32,14 +33,13 @@ from _common import (
     make_parser,
     median_ratio,
     print_header,
-    print_row,
-    slope,
+    print_slopes,
+    tape_bytes,
 )
 from _mujoco import CONES, boxes, faster, ways_to_step
 
 import diffsim as ds
-from diffsim import _core, scenes
-from diffsim.ops import RolloutCall, rollout
+from diffsim import scenes
 
 COUNTS = (20, 100, 200, 300, 1000)
 DT, STEPS = 0.01, 200
@@ -48,16 +48,6 @@ TIMES = ("forward_s", "forward_backward_s", "mujoco_pyramidal_s", "mujoco_ellipt
 RATIOS = tuple(f"{ours}_to_{cone}" for ours in ("forward", "forward_backward") for cone in CONES)
 COLUMNS = ("cubes", "steps", *TIMES, *RATIOS)
 COLUMNS += ("tape_bytes_per_cube_step", "memory_mb", "mujoco_memory_mb", "rest_gap_m")
-
-
-def tape_bytes(sim: ds.Simulator, start: ds.State) -> int:
-    """Of the whole rollout; not public, so asked of the operator."""
-    call = RolloutCall(sim._model, sim._options, STEPS, 1, keep_time=True)
-    inputs = [start.position, start.orientation, start.velocity, start.angular_velocity]
-    no_cloth_nor_controls = (None,) * 8
-    rollout(call, *inputs, *no_cloth_nor_controls, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
-    assert isinstance(call.tape, _core.Tape)
-    return call.tape.nbytes
 
 
 class Worker:
@@ -86,7 +76,7 @@ class Worker:
 
         facts["mujoco_memory_mb"] = added_memory(lambda: mujoco_runs(CONES[0])["mj_step"]())
         facts["rest_gap_m"] = float((advance(sim, start, STEPS).position[-1, :, 2] - 0.5).abs().max())
-        facts["tape_bytes_per_cube_step"] = tape_bytes(sim, start) / (count * STEPS)
+        facts["tape_bytes_per_cube_step"] = tape_bytes(sim, start, STEPS) / (count * STEPS)
         cls.cases = {
             "forward": partial(advance, sim, start, STEPS),
             "forward_backward": partial(differentiate, sim, start, STEPS),
@@ -116,14 +106,13 @@ def row_of(count: int, facts: dict[str, float], rounds: list[dict[str, float]]) 
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=11)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
-    parser.add_argument("--rounds", type=int, default=11, help="of which the medians are printed")
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds = [4], 1
     print_header("mujoco", clock=options.clock)
-    print_row(COLUMNS)
+    table = Table(COLUMNS)
     rounds: dict[int, list[dict[str, float]]] = {count: [] for count in options.counts}
     with ExitStack() as stack:
         spawn = multiprocessing.get_context("spawn")
@@ -132,11 +121,9 @@ def main() -> int:
         for _ in range(options.rounds):  # the numbers of cubes take turns, too, for the sake of the slopes
             for count, worker in workers.items():
                 rounds[count].append(worker.submit(Worker.measure, options.clock).result())
-    rows = [row_of(count, facts[count], rounds[count]) for count in options.counts]
-    for row in rows:
-        print_row(row[name] for name in COLUMNS)
-    slopes = (f"{name} {slope([row['cubes'] for row in rows], [row[name] for row in rows]):.3f}" for name in TIMES)
-    print("# log-log slopes:", ", ".join(slopes))
+    for count in options.counts:
+        table.add(row_of(count, facts[count], rounds[count]))
+    print_slopes({name: table.curve("cubes", name) for name in TIMES})
     return 0
 
 

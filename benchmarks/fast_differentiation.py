@@ -21,7 +21,6 @@ from __future__ import annotations
 import statistics
 import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from _common import (
     STATE_FIELDS,
     Clock,
     Recorded,
+    Table,
     added_memory,
     advance,
     draw_curves,
@@ -38,9 +38,8 @@ from _common import (
     make_parser,
     median_ratio,
     print_header,
-    print_row,
+    print_slopes,
     save_plot,
-    slope,
 )
 from _long_double import rounding
 from _mujoco import CONES, boxes, faster, ways_to_step
@@ -154,32 +153,25 @@ def cost(mode: str, cubes: int, contacts: int) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-def draw(rows: list[dict[str, Any]], figure: Any) -> None:
+def draw(table: Table, figure: Any) -> None:
     columns = {"backward_ms": "backward of a step [ms]", "memory_mb": "peak of memory it adds [MB]"}
     for axes, (column, label) in zip(figure.subplots(1, 2), columns.items()):
-        curves = {}
-        for mode in MODES:
-            of_mode = [row for row in rows if row["mode"] == mode]
-            curves[mode] = ([row["cubes"] for row in of_mode], [row[column] for row in of_mode])
+        curves = {mode: table.curve("cubes", column, mode=mode) for mode in MODES}
         if column == "backward_ms":
-            exact = [row for row in rows if row["mode"] == "exact"]
-            curves["MuJoCo, forward"] = ([row["cubes"] for row in exact], [row["mujoco_forward_ms"] for row in exact])
+            curves["MuJoCo, forward"] = table.curve("cubes", "mujoco_forward_ms", mode="exact")
         draw_curves(axes, curves, "cubes", label)
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=7, plot=True)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
-    parser.add_argument("--rounds", type=int, default=7, help="of which the medians are printed")
     parser.add_argument("--seconds", type=float, default=60.0, help="a backward may take (default: %(default)s)")
     parser.add_argument("--megabytes", type=float, default=4096.0, help="it may add (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds = [8], 1
     print_header("mujoco", clock=options.clock)
-    print_row(COLUMNS)
-    rows = []
+    table = Table(COLUMNS)
     for count in options.counts:
         arrays, contacts = in_fresh_process(settle, count)
         cubes = len(arrays[0])
@@ -199,14 +191,12 @@ def main() -> int:
                 row["dense_to_this"] = found["dense"]["backward_ms"] / row["backward_ms"]
             if mode == "qr":
                 row["paper_dense_to_qr"] = PAPER_SPEEDUP.get(count)
-            rows.append(row)
-            print_row(row.get(name) for name in COLUMNS)
-    for name in ("forward_ms", "backward_ms", "mujoco_forward_ms"):
-        for mode in MODES if name == "backward_ms" else MODES[:1]:
-            of_mode = [row for row in rows if row["mode"] == mode]
-            exponent = slope([row["cubes"] for row in of_mode], [row[name] for row in of_mode])
-            print(f"# log-log slope of {name}, {mode}: {exponent:.3f}")
-    save_plot(options.out / "fast_differentiation.png", partial(draw, rows))
+            table.add(row)
+    curves = {f"{mode} backward": table.curve("cubes", "backward_ms", mode=mode) for mode in MODES}
+    curves["forward"] = table.curve("cubes", "forward_ms", mode="exact")
+    curves["MuJoCo forward"] = table.curve("cubes", "mujoco_forward_ms", mode="exact")
+    print_slopes(curves)
+    save_plot(options.out / "fast_differentiation.png", partial(draw, table))
     return 0
 
 

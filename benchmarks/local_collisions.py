@@ -18,20 +18,19 @@ from __future__ import annotations
 import statistics
 import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
 from _common import (
     Clock,
     Recorded,
+    Table,
     added_memory,
     advance,
     in_fresh_process,
     in_turns,
     make_parser,
     print_header,
-    print_row,
     save_plot,
 )
 
@@ -102,25 +101,21 @@ def draw(rows: list[dict[str, Any]], figure: Any) -> None:
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=15, plot=True)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
-    parser.add_argument("--rounds", type=int, default=15, help="of which the medians are printed")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds = [6], 1
     print_header(clock=options.clock)
-    print_row(COLUMNS)
-    rows = []
+    table = Table(COLUMNS)
     for count in options.counts:
         for mode in MODES:
             found = {
                 zones: in_fresh_process(measure, count, mode, zones, options.rounds, options.clock) for zones in ZONES
             }
             for step in STEPS:
-                rows.append(row_of(count, step, mode, {zones: found[zones][step] for zones in ZONES}))
-                print_row(rows[-1].get(name) for name in COLUMNS)
-    save_plot(options.out / "local_collisions.png", partial(draw, rows))
+                table.add(row_of(count, step, mode, {zones: found[zones][step] for zones in ZONES}))
+    save_plot(options.out / "local_collisions.png", partial(draw, table.rows))
     return 0
 
 

@@ -14,12 +14,12 @@ import math
 import statistics
 import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
 from _common import (
     Clock,
+    Table,
     added_memory,
     advance,
     differentiate,
@@ -29,9 +29,8 @@ from _common import (
     make_parser,
     median_ratio,
     print_header,
-    print_row,
+    print_slopes,
     save_plot,
-    slope,
 )
 from _mujoco import boxes, faster, ways_to_step
 
@@ -127,23 +126,17 @@ def draw(rows: list[dict[str, Any]], figure: Any) -> None:
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=5, plot=True)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of objects")
-    parser.add_argument("--rounds", type=int, default=5, help="of which the medians are printed")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds = [20], 1
     print_header("mujoco", clock=options.clock)
-    print_row(COLUMNS)
-    rows = []
+    table = Table(COLUMNS)
     for count in options.counts:
-        rows.append(in_fresh_process(measure, count, options.rounds, options.clock))
-        print_row(rows[-1].get(name) for name in COLUMNS)
-    counts = [row["objects"] for row in rows]
-    slopes = (f"{name} {slope(counts, [row[name] for row in rows]):.3f}" for name in TIMES)
-    print("# log-log slopes:", ", ".join(slopes))
-    save_plot(options.out / "many_objects.png", partial(draw, rows))
+        table.add(in_fresh_process(measure, count, options.rounds, options.clock))
+    print_slopes({name: table.curve("objects", name) for name in TIMES})
+    save_plot(options.out / "many_objects.png", partial(draw, table.rows))
     return 0
 
 

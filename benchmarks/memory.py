@@ -9,15 +9,15 @@ body.
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
-import subprocess
 import sys
 import time
-from pathlib import Path
 
-from _common import print_header, print_row
+import torch
+from _common import in_fresh_process, make_parser, print_header, print_row, tape_bytes
+
+import diffsim as ds
+from diffsim import scenes
 
 COLUMNS = ("case", "cubes", "steps", "checkpoint_every", "peak_mb", "before_mb", "seconds", "tape_bytes_per_body_step")
 CASES = {"long": (100, 10_000, 100), "large": (10_000, 200, None)}
@@ -31,12 +31,7 @@ def peak_megabytes() -> float:
 
 
 def run(count: int, steps: int, every: int | None, threads: int) -> dict[str, float]:
-    import torch
-
-    import diffsim as ds
-    from diffsim import _core, scenes
-    from diffsim.ops import RolloutCall, rollout
-
+    """In a fresh process."""
     torch.set_num_threads(1)
     sim = ds.Simulator(scenes.falling_cubes(count), dt=DT, num_threads=threads, on_failure="raise")
     sim.mass.requires_grad_()
@@ -51,31 +46,18 @@ def run(count: int, steps: int, every: int | None, threads: int) -> dict[str, fl
     seconds = time.perf_counter() - clock
     assert all(bool(g.isfinite().all()) for g in gradients)
     peak = peak_megabytes()
-
-    call = RolloutCall(sim._model, sim._options, 100, 1, keep_time=True)  # not public, so asked of the operator
-    rollout(call, *inputs.values(), *(None,) * 8, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
-    assert isinstance(call.tape, _core.Tape)
-    return {"peak": peak, "before": before, "seconds": seconds, "tape": call.tape.nbytes / (100 * count)}
+    return {"peak": peak, "before": before, "seconds": seconds, "tape": tape_bytes(sim, start, 100) / (100 * count)}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, cpu_time=False)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="a few seconds: a tenth of the steps, of the cubes")
-    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)  # a case's numbers, in the process that runs it
     options = parser.parse_args()
-    if options.one:
-        count, steps, every = (int(value) for value in options.one)
-        print(json.dumps(run(count, steps, every or None, options.threads)))
-        return 0
-    print_header(clock=time.perf_counter)
+    print_header(clock=options.clock)
     print_row(COLUMNS)
     for name, (count, steps, every) in (QUICK if options.quick else CASES).items():
-        command = [sys.executable, str(Path(__file__)), "--threads", str(options.threads)]
-        command += ["--one", str(count), str(steps), str(every or 0)]
-        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        values = [found[key] for key in ("peak", "before", "seconds", "tape")]
-        print_row([name, count, steps, every or "", *values])
+        found = in_fresh_process(run, count, steps, every, options.threads)
+        print_row([name, count, steps, every, *(found[key] for key in ("peak", "before", "seconds", "tape"))])
     return 0
 
 

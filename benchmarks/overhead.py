@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from _common import in_turns, make_parser, print_header, print_row
+from _common import in_turns, make_parser, print_header, print_row, repeated
 from torch import Tensor
 
 import diffsim as ds
@@ -59,15 +59,9 @@ def cases() -> dict[str, Callable[[], object]]:
     }
 
 
-def repeated(call: Callable[[], object], repeats: int) -> None:
-    for _ in range(repeats):
-        call()
-
-
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=21)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--rounds", type=int, default=21, help="per run; the median of them is printed")
     parser.add_argument("--repeats", type=int, default=500, help="calls per round")
     options = parser.parse_args()
     if options.quick:

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from _common import (
     Clock,
+    Table,
     added_memory,
     advance,
     differentiate,
@@ -31,7 +32,6 @@ from _common import (
     in_turns,
     make_parser,
     print_header,
-    print_row,
     save_plot,
 )
 
@@ -115,10 +115,8 @@ def draw(rows: list[dict[str, Any]], figure: Any) -> None:
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, rounds=3, plot=True)
     parser.add_argument("--scales", type=float, nargs="+", default=SCALES, help="of the cloth")
-    parser.add_argument("--rounds", type=int, default=3, help="of which the medians are printed")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the plot (default: %(default)s)")
     options = parser.parse_args()
     steps = STEPS
     if options.quick:
@@ -129,15 +127,13 @@ def main() -> int:
 
     mesh = load_figure(None, FACES, SIZE)
     print(f"# bunny: {len(mesh.vertices)} vertices; cloth: {NODES * NODES} nodes")
-    print_row(COLUMNS)
-    rows = []
+    table = Table(COLUMNS)
     for scale in options.scales:
-        rows.append(in_fresh_process(measure, mesh, scale, steps, options.rounds, options.clock))
-        print_row(rows[-1][name] for name in COLUMNS)
+        table.add(in_fresh_process(measure, mesh, scale, steps, options.rounds, options.clock))
     for name in ("forward_s", "forward_backward_s", "memory_mb"):
-        values = [row[name] for row in rows]
+        values = [row[name] for row in table.rows]
         print(f"# {name}: largest / smallest {max(values) / min(values):.2f}")
-    save_plot(options.out / "relative_scale.png", partial(draw, rows))
+    save_plot(options.out / "relative_scale.png", partial(draw, table.rows))
     return 0
 
 

@@ -7,15 +7,13 @@ for 20, which one thread steps alone.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 
 import torch
-from _common import in_turns, median_ratio, print_header, print_row
+from _common import advance, in_turns, make_parser, median_ratio, print_header, print_row, repeated
 
 import diffsim as ds
 from diffsim import scenes
@@ -36,25 +34,22 @@ class Case:
         self.backward()
 
     def forward(self) -> None:
-        with torch.no_grad():
-            self.sim.rollout(self.start, None, self.steps)
+        advance(self.sim, self.start, self.steps)
 
     def backward(self) -> None:
         torch.autograd.grad(self.loss, self.sim.mass, retain_graph=True)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, rounds=11, cpu_time=False)
     parser.add_argument("--counts", type=int, nargs="+", default=(20, 100, 300, 1000, 3000), help="numbers of cubes")
     parser.add_argument("--threads", type=int, nargs="+", default=(1, 2), help="beside 1")
     parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--rounds", type=int, default=11, help="of which the medians are printed")
-    parser.add_argument("--quick", action="store_true", help="a few seconds: 20 and 1,000 cubes, 3 rounds")
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds, options.steps = (20, 1000), 3, 80
     torch.set_num_threads(1)
-    print_header(clock=time.perf_counter)
+    print_header(clock=options.clock)
     print_row(COLUMNS)
     for count in options.counts:
         cases = {threads: Case(count, threads, options.steps) for threads in sorted({1, *options.threads})}
@@ -71,11 +66,6 @@ def main() -> int:
             medians = [statistics.median(values) / repeats for values in times]
             print_row([count, options.steps, threads, *medians, *speedups])
     return 0
-
-
-def repeated(call: Callable[[], object], repeats: int) -> None:
-    for _ in range(repeats):
-        call()
 
 
 if __name__ == "__main__":
