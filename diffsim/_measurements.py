@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 class Measurements(nn.Module):
     """Mixed into `Simulator`. All methods take states with any leading axes (batch, time), return those axes, and keep
-    the dtype of the state; they are float64 inside.
+    the dtype of the state; they are float64 inside. They raise TypeError or ValueError, as a step does, for a state
+    that is not one of this scene.
     """
 
     mass: nn.Parameter
@@ -39,16 +40,25 @@ class Measurements(nn.Module):
     _elements: ClothElements | None  #: None without cloth
 
     def kinetic_energy(self, state: State) -> Tensor:
-        """½ m v² + ½ ω·I ω over the dynamic bodies and the cloth nodes that are not pinned [J], shape (...);
-        differentiable (state, `mass`, `inertia`, `cloth_density`).
+        """½ m v² + ½ ω·I ω over the dynamic bodies and the cloth nodes that are not pinned [J], shape (...).
+
+        Args:
+            state: With any leading axes (...).
+        Raises: TypeError, ValueError for a state that is not one of this scene.
+        Gradients: with respect to the state, `mass`, `inertia` and `cloth_density`.
         """
         self._check_state("kinetic_energy", state)
         return _energies.kinetic_energy(state, self.mass, self.inertia, self._node_mass())
 
     def potential_energy(self, state: State) -> Tensor:
         """Σ -m g·x over the dynamic bodies and the cloth nodes that are not pinned, and what stretching, shearing and
-        bending cloth stored [J], shape (...); without what contacts store by their compliance. Differentiable (state,
-        `mass`, `gravity`, `cloth_density`, `cloth_stretch`, `cloth_shear`, `cloth_bend`).
+        bending cloth stored [J], shape (...); without what contacts store by their compliance.
+
+        Args:
+            state: With any leading axes (...).
+        Raises: TypeError, ValueError for a state that is not one of this scene.
+        Gradients: with respect to the state, `mass`, `gravity`, `cloth_density`, `cloth_stretch`, `cloth_shear` and
+            `cloth_bend`.
         """
         self._check_state("potential_energy", state)
         energy = _energies.gravitational_energy(state, self.mass, self.gravity, self._node_mass())
@@ -58,15 +68,24 @@ class Measurements(nn.Module):
         return energy.to(state.dtype)
 
     def momentum(self, state: State) -> Tensor:
-        """Σ m v over the dynamic bodies and the cloth nodes that are not pinned, world frame [kg·m/s], shape (..., 3);
-        differentiable (state, `mass`, `cloth_density`).
+        """Σ m v over the dynamic bodies and the cloth nodes that are not pinned, world frame [kg·m/s], shape (..., 3).
+
+        Args:
+            state: With any leading axes (...).
+        Raises: TypeError, ValueError for a state that is not one of this scene.
+        Gradients: with respect to the state, `mass` and `cloth_density`.
         """
         self._check_state("momentum", state)
         return _energies.momentum(state, self.mass, self._node_mass())
 
     def angular_momentum(self, state: State) -> Tensor:
-        """Σ x × m v + I ω over the dynamic bodies and the cloth nodes that are not pinned, about the world's origin
-        [kg·m²/s], shape (..., 3); differentiable (state, `mass`, `inertia`, `cloth_density`).
+        """Σ x × m v + I ω over the dynamic bodies and the cloth nodes that are not pinned, about the world's origin,
+        world frame [kg·m²/s], shape (..., 3).
+
+        Args:
+            state: With any leading axes (...).
+        Raises: TypeError, ValueError for a state that is not one of this scene.
+        Gradients: with respect to the state, `mass`, `inertia` and `cloth_density`.
         """
         self._check_state("angular_momentum", state)
         return _energies.angular_momentum(state, self.mass, self.inertia, self._node_mass())
@@ -79,8 +98,12 @@ class Measurements(nn.Module):
         count, and of two that are nearer at rest than the cloth is thick, half their distance at rest takes the place
         of the margins, as in contact: a sheet that lies flat reports about the size of its triangles.
 
-        Returns: A float; for a state with leading axes a tensor of their shape. Infinite if nothing can meet. Not
-            differentiable.
+        Args:
+            state: With any leading axes (...).
+        Returns: A float; for a state with leading axes a tensor of their shape. Infinite if nothing can meet.
+        Raises: TypeError, ValueError for a state that is not one of this scene; NotImplementedError inside a transform
+            of torch.func.
+        Gradients: none.
         """
         self._check_state("min_distance", state)
         self._refuse_transforms("min_distance")
@@ -92,16 +115,25 @@ class Measurements(nn.Module):
 
     def mesh_transform(self, state: State) -> Tensor:
         """Where the frames of the meshes are, as they were given to `add_body`: homogeneous matrices, mesh to world,
-        shape (..., n_bodies, 4, 4); differentiable (state).
+        shape (..., n_bodies, 4, 4), their last columns in m.
+
+        Args:
+            state: With any leading axes (...).
+        Raises: TypeError, ValueError for a state that is not one of this scene.
+        Gradients: with respect to the state.
         """
         self._check_state("mesh_transform", state)
         return _energies.mesh_transform(state, torch.from_numpy(self._packed.mesh_offset))
 
     def vertices(self, state: State) -> Tensor:
-        """World positions of all vertices, body after body, then cloth after cloth [m], shape (..., n_vertices, 3);
-        differentiable (state).
+        """World positions of all vertices, body after body, then cloth after cloth [m], shape (..., n_vertices, 3).
 
         A sphere is one vertex, its centre; a capsule two, the ends of its axis. Those of cloths are their nodes.
+
+        Args:
+            state: With any leading axes (...).
+        Raises: TypeError, ValueError for a state that is not one of this scene.
+        Gradients: with respect to the state.
         """
         self._check_state("vertices", state)
         body_of_vertex = torch.from_numpy(np.repeat(np.arange(self._body_count), self._packed.vertex_count))
@@ -118,6 +150,9 @@ class Measurements(nn.Module):
         Args:
             state: Without leading axes.
             handle: As returned by `add_body` or `add_cloth`, or the index of an object, bodies first.
+        Returns: Vertices in world axes [m], faces as they were given to the scene.
+        Raises: ValueError for a state with leading axes, IndexError for an object there is not.
+        Gradients: none.
         """
         import trimesh
 
@@ -150,10 +185,15 @@ class Measurements(nn.Module):
     def separate(self, state: State) -> State:
         """The state with dynamic bodies and cloth moved apart that are nearer to something than they may come to rest.
 
-        For states made by hand. Velocities stay. To autograd the shift is a constant, as if nothing moved.
+        For states made by hand. Velocities stay.
 
-        Raises: ValueError for a state of the wrong shape; for one whose meshes cross, or in which there is no room for
-            the thickness, naming the pair.
+        Args:
+            state: With any leading axes.
+        Returns: The same state, position, orientation and node_position changed where something was too near.
+        Raises: TypeError, ValueError for a state that is not one of this scene; ValueError for one whose meshes cross,
+            or in which there is no room for the thickness, naming the pair; NotImplementedError inside a transform of
+            torch.func.
+        Gradients: of the state itself: the shift is a constant, as if nothing moved.
         """
         self._check_state("separate", state)
         self._refuse_transforms("separate")

@@ -53,12 +53,12 @@ class DirectionCheck:
 class GradcheckReport:
     """What `gradcheck` found. Print it for a table."""
 
-    directions: tuple[DirectionCheck, ...]
+    directions: tuple[DirectionCheck, ...]  #: as many per name as were asked for
     zero_gradients: tuple[str, ...]  #: names whose gradient is zero: nothing was tested there
-    steps: int
-    eps: float
-    median_tolerance: float
-    max_tolerance: float
+    steps: int  #: of the rollout
+    eps: float  #: how far to either side
+    median_tolerance: float  #: of `median_error`, relative
+    max_tolerance: float  #: of `max_error`, relative
 
     @property
     def stable(self) -> tuple[DirectionCheck, ...]:

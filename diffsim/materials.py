@@ -14,7 +14,10 @@ _UNITS = {"density": "kg/m²", "stretch": "N/m", "shear": "N/m", "bend": "N·m"}
 
 @dataclass(frozen=True)
 class ClothMaterial:
-    """A cloth's material; the defaults are those of `cotton`.
+    """A cloth's material, as numbers; the defaults are those of `cotton`.
+
+    Gradients reach the parameters a simulator makes of it, `sim.cloth_density`, `sim.cloth_stretch`, `sim.cloth_shear`,
+    `sim.cloth_bend` and `sim.cloth_damping`, and not `poisson`.
 
     In its plane the sheet is orthotropic St. Venant-Kirchhoff, equally stiff along warp and weft. With Green's strain
     ε, 1 the warp's direction and 2 the weft's, it stores per area
@@ -77,8 +80,9 @@ class ClothMaterial:
             young: Young's modulus [Pa].
             thickness: [m]
             density: Mass per volume [kg/m³].
-            poisson: Poisson's ratio.
-            damping: [s]
+            poisson: Poisson's ratio, above -1 and at most 0.5.
+            damping: Ratio of viscous to elastic stiffness [s].
+        Raises: TypeError, ValueError naming the argument, for what is not a finite number in range.
         """
         where = "ClothMaterial.isotropic"
         young = positive(young, f"{where}: young", "Pa")

@@ -79,7 +79,24 @@ class SolverError(RuntimeError):
 
 
 class RolloutCall:
-    """What one call of `rollout` needs beside tensors, and what it leaves behind. Use an instance once."""
+    """What one call of `rollout` needs beside tensors, and what it leaves behind. Use an instance once.
+
+    Args:
+        model: What moves.
+        options: How steps are taken.
+        steps: Number of them.
+        num_threads: How many threads may be used; no result depends on it.
+        controls_have_time: Whether the controls have a time axis.
+        keep_time: Whether the outputs have one, or are those of the last step.
+        keep_tape: Whether the backward finds a record; without, it runs the forward again (checkpointing).
+        want_signature: Whether `signature` is to be filled in.
+        first_step: How many steps other calls made before, for error messages.
+
+    Attributes:
+        info: Statistics, after the call.
+        tape: What the backward needs, where something requires grad.
+        signature: Hash of each step's active contacts, uint64, shape (steps[, B]).
+    """
 
     __slots__ = (
         "controls_have_time",

@@ -1,7 +1,8 @@
 """Rotations as unit quaternions `w, x, y, z`, and the roll-pitch-yaw convention of Qiao et al. 2020, Appendix A to C.
 
-All functions take leading batch axes, broadcast, and are differentiable. Torch tensors give tensors; numpy arrays (and
-lists) give float64 arrays.
+All functions take leading batch axes, broadcast, and are differentiable in all their arguments. Torch tensors give
+tensors; numpy arrays (and lists) give float64 arrays. Only shapes that do not fit raise (torch's RuntimeError or
+ValueError); values are not checked.
 
 What the gradient with respect to a quaternion means. A rotation has three degrees of freedom, its quaternion q four
 numbers. `to_matrix`, `rotate`, `log` and `to_rpy`, like the simulator, are functions of q / |q|: defined for every q

@@ -25,6 +25,8 @@ class Scene:
     Adding an object checks it and raises at once, so that the error points at the line that is wrong; what concerns
     several objects (do they overlap?) is checked by the simulator through `validate`.
 
+    A scene holds numbers. What gradients reach is the `State` a simulator makes of it, and the simulator's parameters.
+
     Args:
         gravity: Acceleration [m/s²], world, shape (3,).
     Raises: ValueError if gravity is not three finite numbers.
@@ -128,9 +130,12 @@ class Scene:
         restitution: float = 0.0,
         name: str | None = None,
     ) -> BodyHandle:
-        """Add an exact sphere: one vertex with a margin of `radius` [m]. Solid, unless `inertia` says otherwise.
+        """Add an exact sphere: one vertex with a margin of `radius`. Solid, unless `inertia` says otherwise.
 
-        Everything else as for `add_body`; the radius takes the place of the margin.
+        The radius [m] takes the place of `add_body`'s margin; all other arguments are as there.
+
+        Returns: A handle that is the body's index.
+        Raises: As `add_body`; ValueError for a radius that is not positive.
         """
         where, name = self._name(name, "body", len(self._bodies))
         kind = body_kind(kind, where)
@@ -157,10 +162,13 @@ class Scene:
         restitution: float = 0.0,
         name: str | None = None,
     ) -> BodyHandle:
-        """Add an exact capsule about the body's z axis: two vertices `length` apart with a margin of `radius` [m].
+        """Add an exact capsule about the body's z axis: two vertices `length` apart with a margin of `radius`.
 
-        Its total length is `length + 2 radius`. Solid, unless `inertia` says otherwise. Everything else as for
-        `add_body`; the radius takes the place of the margin.
+        Its length from end to end is `length + 2 radius` [m]. Solid, unless `inertia` says otherwise. The radius takes
+        the place of `add_body`'s margin; all other arguments are as there.
+
+        Returns: A handle that is the body's index.
+        Raises: As `add_body`; ValueError for a radius or length that is not positive.
         """
         where, name = self._name(name, "body", len(self._bodies))
         kind = body_kind(kind, where)
@@ -249,6 +257,7 @@ class Scene:
                 given (so also the radius of spheres and capsules) included, sides of length zero (of a flat static
                 mesh) left out, or of the second longest side of a cloth's box, its width; 1e-3 m if there is no object.
                 With cloth, at most 0.1 of the smallest height of its triangles, which must stay clear of each other.
+        Returns: One array per field, see `PackedScene`.
         Raises: ValueError for a thickness that is not positive, or a cloth with triangles smaller than it is thick.
         """
         return pack_scene(self._bodies, self._cloths, self._ground, self._gravity, thickness)

@@ -1,7 +1,7 @@
 """Small closed meshes, faces outwards, and sheets for cloth, as `(vertices, faces)`: shape (n, 3) float64 [m] and
 (m, 3) int32.
 
-For scenes, tests and first steps; anything else comes from a file or from trimesh.
+For scenes, tests and first steps; anything else comes from a file or from trimesh. Nothing here is differentiable.
 """
 
 from __future__ import annotations
@@ -37,10 +37,13 @@ def tetrahedron(size: float = 1.0) -> Mesh:
 
 
 def icosphere(radius: float = 0.5, subdivisions: int = 2) -> Mesh:
-    """A faceted sphere around the origin: an icosahedron [radius in m] whose 20 faces are split in four `subdivisions`
-    times.
+    """A faceted sphere around the origin: an icosahedron whose 20 faces are split in four `subdivisions` times.
 
     Vertices lie on the sphere, so its volume falls short. For an exact sphere use `Scene.add_sphere`.
+
+    Args:
+        radius: Of the sphere the vertices lie on [m].
+        subdivisions: 0 for the icosahedron itself; each makes four times as many faces.
     """
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     vertices = np.array([[0.0, i, j * golden] for i in (-1, 1) for j in (-1, 1)])
@@ -69,6 +72,7 @@ def prism(outline: Sequence[Sequence[float]], height: float) -> Mesh:
         outline: The corners in the xy plane, counter-clockwise, shape (n, 2) [m]; it may be non-convex, but must not
             cross itself.
         height: [m]
+    Raises: ValueError for an outline that is clockwise or repeats a corner.
     """
     points = np.asarray(outline, dtype=np.float64)
     count = len(points)
@@ -123,6 +127,7 @@ def sheet(size: Sequence[float] | float = 1.0, nodes: Sequence[int] | int = 21) 
     Args:
         size: Sides along x and y, or one for a square [m].
         nodes: Numbers of nodes along x and y, or one for both; at least 2.
+    Raises: ValueError for a side that is not positive, or fewer than two nodes along one.
     """
     width, depth = np.broadcast_to(np.asarray(size, dtype=np.float64), 2).tolist()
     nx, ny = np.broadcast_to(np.asarray(nodes), 2).tolist()

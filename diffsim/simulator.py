@@ -271,7 +271,8 @@ class Simulator(Measurements):
             checkpoint_every: Keep the record gradients need only for this many steps at a time, k, and compute it again
                 in the backward: memory O(steps / k + k), about one more forward in time, the same values bit by bit.
             progress: Show a progress bar on stderr.
-        Returns: State with a leading time axis: after the first step, ..., after the last.
+        Returns: State with a leading time axis: after the first step, ..., after the last. Its tensors have shapes
+            (steps[, B], n, 3), with a batch axis if any input has one.
         Raises: As for one step.
         Gradients: As for one step. A float32 rollout is float64 throughout and rounded once, at the end.
         """

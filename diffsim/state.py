@@ -37,11 +37,11 @@ class _TensorFields:
         return self._map(Tensor.clone)
 
     def to(self: T, dtype: torch.dtype) -> T:
-        """The same values in another dtype (float32 or float64); gradients flow through it."""
+        """The same values in another dtype (float32 or float64); gradients flow through it, in the dtype there was."""
         return self._map(lambda t: t.to(dtype))
 
     def replace(self: T, **tensors: Tensor | None) -> T:
-        """A copy with some fields exchanged: ``state.replace(velocity=v)``."""
+        """A copy with some fields exchanged: ``state.replace(velocity=v)``; TypeError for a name that is no field."""
         names = [field.name for field in fields(self)]  # type: ignore[arg-type]
         for name in tensors:
             if name not in names:
@@ -49,7 +49,10 @@ class _TensorFields:
         return type(self)(**{**self.__dict__, **tensors})
 
     def __getitem__(self: T, index: Any) -> T:
-        """Index the leading axes (time, batch) of every tensor: ``trajectory[-1]``, ``trajectory[:, 3]``."""
+        """Index the leading axes (time, batch) of every tensor: ``trajectory[-1]``, ``trajectory[:, 3]``.
+
+        Raises: TypeError for an index with ``...``, or one that reaches past the leading axes.
+        """
         entries = index if isinstance(index, tuple) else (index,)
         if any(entry is Ellipsis for entry in entries):
             raise TypeError(f"{type(self).__name__}: the index is for leading axes and takes no '...'; index one field")
@@ -80,7 +83,8 @@ class State(_TensorFields):
     """Where everything is and how it moves; a pytree, so torch.func, pickle and torch.save take it.
 
     Every tensor may carry leading axes: one for a batch of scenes, and what `Simulator.rollout` returns carries
-    one more in front, for time. Bodies come in the order they were added, SI units, world frame.
+    one more in front, for time. Bodies come in the order they were added, SI units, world frame. Gradients flow through
+    all of them.
 
     Args:
         position: Centres of mass [m], shape (..., n_bodies, 3).
@@ -91,7 +95,9 @@ class State(_TensorFields):
         node_position: Cloth nodes [m], shape (..., n_nodes, 3), all cloths concatenated. Default: no nodes.
         node_velocity: Cloth nodes [m/s], shape (..., n_nodes, 3). Default: zero.
 
-    The tensors are checked where they are used, by the simulator that knows how many bodies there are.
+    The other tensors are checked where they are used, by the simulator that knows how many bodies there are.
+
+    Raises: TypeError for a position that is no tensor, ValueError for one of another shape.
     """
 
     position: Tensor
@@ -143,7 +149,8 @@ class State(_TensorFields):
 class Control(_TensorFields):
     """What drives one step (or, with a leading time axis, a rollout); any field may be None, and then is zero.
 
-    Every tensor may carry one leading batch axis of its own. SI units, world frame, dtype of the state.
+    Every tensor may carry one leading batch axis of its own. SI units, world frame, dtype of the state. Gradients reach
+    all of them.
 
     Args:
         force: At the centre of mass [N], shape (..., n_bodies, 3), constant over the step.

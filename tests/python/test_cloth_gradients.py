@@ -23,7 +23,7 @@ EPS = 3e-7
 MEDIAN_TOLERANCE = 1e-6
 MAX_TOLERANCE = 1e-4
 # Between two adjoints that solve the same system in another order.
-SAME_SYSTEM = 1e-9
+SAME_SYSTEM = 1e-12
 MATERIAL = ds.ClothMaterial(density=0.2, stretch=500.0, shear=60.0, bend=1e-4, damping=0.02, poisson=0.2)
 OF_CLOTH = ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend", "cloth_damping")
 OF_NODES = ("node_position", "node_velocity", "node_force")

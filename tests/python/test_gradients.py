@@ -25,8 +25,8 @@ SEEDS = (1, 2)  # of forces and directions
 # resolve about 1e-8 (the solver leaves 1e-10 of a contact force, times the stiffness of a contact).
 MEDIAN_TOLERANCE = 1e-6
 MAX_TOLERANCE = 1e-4
-# Between two adjoints that solve the same system; sums in another order, amplified by the contacts' conditioning.
-SAME_SYSTEM = 1e-9
+# Between two adjoints that solve the same system: sums in another order.
+SAME_SYSTEM = 1e-11
 # Between the exact adjoint and those without curvature, where there is none; the exact one takes the stiffness where
 # the last Newton step left it, which is 1e-10 of the largest force away from the others'.
 NO_CURVATURE = 1e-8
