@@ -10,8 +10,8 @@ namespace {
 
 constexpr int kMaxNewtonSteps = 50;
 constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
-constexpr double kQpTolerance = 1e-9;    // of the starting gradient: a search direction needs no more
-constexpr double kFullStep = 1e-3;       // a step this near to 1 ends where the rows it was made for say
+constexpr double kQpTolerance = 1e-9;    // of the starting gradient, or of the forces: a search direction needs no more
+constexpr double kFullStep = 1e-3;       // steps this near to 1 end where the rows they were made for say
 // More forces at once make their dense system dearer than factors of the sparse one, measured at 20² to 100² nodes.
 constexpr double kPushingPerRootNode = 10.0;
 constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
@@ -244,10 +244,16 @@ bool ImpactForces::solve(
         pushing.clear();
         for (std::size_t r = 0; r < count; ++r)
             if (violation[r] > 0.0) pushing.push_back(static_cast<int>(r));
-        if (std::abs(t - 1.0) < kFullStep && pushing == pushed_before) break;
+        if (t == 1.0 && pushing == pushed_before) break;
         if (static_cast<int>(pushing.size()) > m_most_pushing) return false;
         if (!close(mass_factor, rows, pushing, missing, next)) return false;
-        for (std::size_t r = 0; r < count; ++r) next[r] -= m_forces[r];
+        double change = 0.0, largest = 0.0;
+        for (std::size_t r = 0; r < count; ++r) {
+            largest = std::max(largest, next[r]);
+            next[r] -= m_forces[r];
+            change = std::max(change, std::abs(next[r]));
+        }
+        if (!(change > kQpTolerance * largest)) break;
         const Coordinates step = pushed(mass_factor, rows, next);
         double first = 0.0, second = 0.0;
         for (std::size_t r = 0; r < count; ++r) {
@@ -257,6 +263,7 @@ bool ImpactForces::solve(
         }
         if (!(second > 0.0)) break;
         t = exact_line_search(violation, slope, rows, first, second);
+        if (std::abs(t - 1.0) < kFullStep) t = 1.0;
         for (std::size_t r = 0; r < count; ++r) {
             m_forces[r] += t * next[r];
             violation[r] -= t * slope[r];

@@ -311,6 +311,7 @@ TEST(half_solutions_give_products_with_the_inverse) {
     systems.push_back(make_system({3, 6, 2, 3}, {}, random));  // nothing coupled
     for (const System& system : systems) {
         SparseBlockCholesky cholesky;
+        cholesky.analyze(system.sizes, system.pairs);
         CHECK(factorize(cholesky, system));
         const std::vector<int> start = system.starts();
         const int count = static_cast<int>(system.sizes.size());
