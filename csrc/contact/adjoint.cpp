@@ -84,7 +84,8 @@ class ContactTermMaker {
 public:
     ContactTermMaker(const Zone& zone, const ZonePoint& point) : m_zone(zone), m_point(point) {}
 
-    ContactTerm operator()(const ActiveContact& active, bool with_curvature) const {
+    /// Curvature::none leaves the Hessian unset.
+    ContactTerm operator()(const ActiveContact& active, Curvature curvature) const {
         const ZoneContact& contact = m_zone.contacts[active.index];
         ContactTerm term;
         if (contact.contact.with_ground()) {
@@ -92,17 +93,17 @@ public:
             if (contact.cloth_a >= 0)
                 node_on_ground(contact, active, term);
             else
-                body_on_ground(contact, active, with_curvature, term);
+                body_on_ground(contact, active, curvature, term);
             return term;
         }
         if (contact.cloth_a >= 0)
             fill(
-                contact, active, with_curvature, cloth(contact, active, true, term),
-                cloth(contact, active, false, term), term);
+                contact, active, curvature, cloth(contact, active, true, term), cloth(contact, active, false, term),
+                term);
         else if (contact.cloth_b >= 0)
-            fill(contact, active, with_curvature, body(contact.a, 0, term), cloth(contact, active, false, term), term);
+            fill(contact, active, curvature, body(contact.a, 0, term), cloth(contact, active, false, term), term);
         else
-            fill(contact, active, with_curvature, body(contact.a, 0, term), body(contact.b, 1, term), term);
+            fill(contact, active, curvature, body(contact.a, 0, term), body(contact.b, 1, term), term);
         return term;
     }
 
@@ -120,24 +121,26 @@ private:
 
     template <class A, class B>
     static void fill(
-        const ZoneContact& contact, const ActiveContact& active, bool with_curvature, const A& a, const B& b,
+        const ZoneContact& contact, const ActiveContact& active, Curvature curvature, const A& a, const B& b,
         ContactTerm& term) {
         term.sides[1].offset = A::kSize;
-        const auto d =
-            contact_derivatives(active.geometry, contact.range, contact.stiffness.value, a, b, true, with_curvature);
+        const bool with_hessian = curvature != Curvature::none;
+        const auto d = contact_derivatives(
+            active.geometry, contact.range, contact.stiffness.value, a, b, with_hessian,
+            curvature != Curvature::dropped);
         term.row = d.row;
         term.gradient = d.gradient;
-        term.hessian = d.hessian;
+        if (with_hessian) term.hessian = d.hessian;
         term.force = d.force;
         term.stiffness = d.stiffness;
     }
 
     void body_on_ground(
-        const ZoneContact& contact, const ActiveContact& active, bool with_curvature, ContactTerm& term) const {
+        const ZoneContact& contact, const ActiveContact& active, Curvature curvature, ContactTerm& term) const {
         term.sides[0].body = contact.a;
         const GroundDerivatives d = ground_derivatives(
             active.geometry.distance, active.geometry.closest.point_a - m_point.poses[contact.a].t, contact.range,
-            contact.stiffness.value, with_curvature);
+            contact.stiffness.value, curvature != Curvature::dropped);
         term.row = d.row;
         term.gradient = -d.force * d.row;
         term.hessian = d.hessian;
@@ -172,7 +175,7 @@ Rows collect_rows(const Zone& zone, const ZonePoint& point, const FreeCoordinate
     const Eigen::Index count = static_cast<Eigen::Index>(point.active.size());
     Rows rows{MatrixX::Zero(count, free.size()), VectorX(count)};
     for (Eigen::Index k = 0; k < count; ++k) {
-        const ContactTerm term = make_term(point.active[static_cast<std::size_t>(k)], false);
+        const ContactTerm term = make_term(point.active[static_cast<std::size_t>(k)], Curvature::none);
         rows.stiffness[k] = term.stiffness;
         term.for_each(
             [&](int body, int offset) {
@@ -225,8 +228,7 @@ MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordin
 /// With the exact elastic Hessian, or its projection where the exact one is not positive definite.
 MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free) {
     MatrixX cloth = cloth_matrix(zone, point, free, kNothingCut);
-    if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success)
-        cloth = cloth_matrix(zone, point, free, kAllCut);
+    if (cloth.rows() > 0 && cloth.llt().info() != Eigen::Success) cloth = cloth_matrix(zone, point, free, kAllCut);
     return cloth;
 }
 
@@ -324,7 +326,7 @@ std::vector<double> harden(
     constexpr double kTolerance = 1e-14;  // on the change of z, relative: rounding
     const ContactTermMaker make_term(zone, point);
     std::vector<ContactTerm> terms;
-    for (const ActiveContact& active : point.active) terms.push_back(make_term(active, false));
+    for (const ActiveContact& active : point.active) terms.push_back(make_term(active, Curvature::none));
     std::vector<double> reactions(terms.size(), 0.0);
     for (int step = 0; step < kMaxSteps; ++step) {
         std::vector<double> next = reactions;
@@ -376,22 +378,45 @@ std::vector<double> solve(
     return zone.hard ? harden(zone, point, upstream, solve_in_place, z) : std::vector<double>();
 }
 
-/// What contacts add to the gradients: `twist` times their second derivatives, and their reactions if they are hard.
+/// What the contacts of a body that yields take of the upstream gradient v, along its twist J dy at the end of the step.
+/// With H = M + C + Jᵀ K J the matrix of  H z = v,  K of the contacts and C the curvature of the chart under their torque:
+///     K J z + Jᵀ⁻¹ (M + C) z = Jᵀ⁻¹ v.
+/// Of hard contacts, whose reactions stand beside H z, they are part of it.
+Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, const Vec6& v, const Vec6& z) {
+    Vec6 share = v;
+    share.head<3>() -= body.inertia * z.head<3>();
+    share.tail<3>() -= body.mass * z.tail<3>();
+    const Vec3 theta = y.head<3>();
+    if (theta.isZero(0.0)) return share;
+    if (!torque.isZero(0.0)) share.head<3>() -= chart_curvature(y, torque) * z.head<3>();
+    // J has no inverse at a full turn, where no chart is left: with pivots the answer stays finite.
+    const Mat3 J = left_jacobian(theta);
+    share.head<3>() = J.transpose().fullPivLu().solve(share.head<3>()).eval();
+    return share;
+}
+
+/// What contacts add to the gradients: to those of places that the linear system has no rows for, `twist` times their
+/// second derivatives and the reactions of hard ones; to those of masses, through their stiffness.
 /// `multipliers`: stiffness times what opens each contact along `twist`, where contacts are rows of constant direction;
 /// null where they have curvature.
 void add_contacts(
     const Zone& zone, const ZonePoint& point, const VectorX* multipliers, const GradientNeeds& needs,
     const std::vector<Vec6>& twist, const std::vector<double>& reactions, ZoneAdjoint& result) {
     const ContactTermMaker make_term(zone, point);
+    const bool through_stiffness = needs.mass && !zone.hard;  // a hard one's is only how its multiplier was found
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
-        const ContactTerm term = make_term(active, multipliers == nullptr && needs.place);
+        const bool of_bodies = zone.yields(contact.a) && (contact.contact.with_ground() || zone.yields(contact.b));
+        const bool with_place = needs.place && !of_bodies;
+        if (!with_place && !through_stiffness) continue;
+        const ContactTerm term =
+            make_term(active, with_place && multipliers == nullptr ? Curvature::full : Curvature::none);
         SmallVector motion = SmallVector::Zero(term.row.size());
         term.for_each(
             [&](int body, int offset) { motion.segment<6>(offset) = twist[body]; },
             [&](int node, int offset) { motion.segment<3>(offset) = result.multiplier.nodes[node]; });
-        if (needs.place) {
+        if (with_place) {
             SmallVector gradient;
             if (multipliers == nullptr)
                 gradient = term.hessian.lazyProduct(motion);  // of this size a library call is slower
@@ -399,10 +424,12 @@ void add_contacts(
                 gradient = (*multipliers)[static_cast<Eigen::Index>(k)] * term.row;
             if (zone.hard) gradient += reactions[k] * term.row;
             term.for_each(
-                [&](int body, int offset) { result.place_gradient.bodies[body] -= gradient.segment<6>(offset); },
+                [&](int body, int offset) {
+                    if (!zone.yields(body)) result.place_gradient.bodies[body] -= gradient.segment<6>(offset);
+                },
                 [&](int node, int offset) { result.place_gradient.nodes[node] -= gradient.segment<3>(offset); });
         }
-        if (!needs.mass || zone.hard) continue;  // a hard contact's stiffness is only how its multiplier was found
+        if (!through_stiffness) continue;
         const double along = term.gradient.dot(motion);
         for (std::size_t s = 0; s < static_cast<std::size_t>(term.side_count); ++s) {
             const double part = -along * (s == 0 ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b);
@@ -509,14 +536,17 @@ const ZoneAdjoint& zone_adjoint(
         twist[i] = result.multiplier.bodies[i];
         twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();
     }
+    for (int i = 0; i < zone.dynamic_count && needs.place; ++i) {
+        const Vec3 torque = exact ? derivatives.torque[i] : Vec3(Vec3::Zero());
+        Vec6& gradient = result.place_gradient.bodies[i];
+        gradient =
+            -contact_share(zone.bodies[i], point.y.bodies[i], torque, upstream.bodies[i], result.multiplier.bodies[i]);
+        // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
+        gradient.head<3>() -= 0.5 * torque.cross(twist[i].head<3>());
+    }
     if (needs.place || needs.mass)
         add_contacts(zone, point, exact ? nullptr : &multipliers, needs, twist, reactions, result);
     if (!zone.cloths.empty() && zone.elastic) add_elasticity(zone, point, needs, result);
-    if (exact) {
-        // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
-        for (int i = 0; i < zone.dynamic_count; ++i)
-            result.place_gradient.bodies[i].head<3>() -= 0.5 * skew(derivatives.torque[i]) * twist[i].head<3>();
-    }
     return result;
 }
 
