@@ -1,7 +1,9 @@
 #include "contact/contact_derivatives.hpp"
 
-#include <Eigen/LU>
+#include <Eigen/Geometry>
 #include <cmath>
+#include <type_traits>
+#include <utility>
 
 #include "math/rotation.hpp"
 
@@ -18,65 +20,74 @@ Mat3 turn_curvature(const Vec3& r, const Vec3& n) {
     return m;
 }
 
-/// How the coordinates of a rigid body move the closest point on it and the directions of its features.
+/// How the turn of a rigid body moves the closest point on it and the directions of its features. Of two bodies only their
+/// relative shift matters, so that of one of them the turn is enough.
+class TurnMotion {
+public:
+    static constexpr int kSize = 3;
+    static constexpr int kSlideSize = 3;  ///< the first coordinates, which alone change the slide directions
+    TurnMotion(const BodySide& side, const Vec3& point) : m_arm(point - side.center) {}
+
+    /// n · d(point).
+    Vec3 row(const Vec3& n) const { return m_arm.cross(n); }
+    /// Add n · d²(point), times a factor.
+    template <class Block>
+    void add_point_curvature(const Vec3& n, double factor, Block&& hessian) const {
+        hessian += factor * turn_curvature(m_arm, n);
+    }
+    /// n · d(slide direction k).
+    Vec3 slide(int, const Vec3& direction, const Vec3& n) const { return direction.cross(n); }
+    /// d(unit direction of an edge).
+    Mat3 direction(const Vec3& unit) const { return -skew(unit); }
+    /// other · d²(unit direction of an edge).
+    Mat3 direction_curvature(const Vec3& unit, const Vec3& other) const { return turn_curvature(unit, other); }
+
+private:
+    Vec3 m_arm;
+};
+
+/// The same for turn and shift of a rigid body.
 class BodyMotion {
 public:
     static constexpr int kSize = 6;
-    BodyMotion(const BodySide& side, const Vec3& point) : m_arm(point - side.center) {}
+    static constexpr int kSlideSize = 3;
+    BodyMotion(const BodySide& side, const Vec3& point) : m_turn(side, point) {}
 
     Vec6 row(const Vec3& n) const {
         Vec6 result;
-        result << m_arm.cross(n), n;
+        result << m_turn.row(n), n;
         return result;
     }
-    Rows3<6> point() const {
-        Rows3<6> result;
-        result << -skew(m_arm), Mat3::Identity();
-        return result;
+    template <class Block>
+    void add_point_curvature(const Vec3& n, double factor, Block&& hessian) const {
+        m_turn.add_point_curvature(n, factor, hessian.template topLeftCorner<3, 3>());
     }
-    /// n · d²(point).
-    Mat6 point_curvature(const Vec3& n) const {
-        Mat6 result = Mat6::Zero();
-        result.topLeftCorner<3, 3>() = turn_curvature(m_arm, n);
-        return result;
-    }
-    /// n · d(slide direction k).
-    Vec6 slide(int, const Vec3& direction, const Vec3& n) const {
-        Vec6 result = Vec6::Zero();
-        result.head<3>() = direction.cross(n);
-        return result;
-    }
-    /// d(unit direction of an edge).
+    Vec3 slide(int k, const Vec3& direction, const Vec3& n) const { return m_turn.slide(k, direction, n); }
     Rows3<6> direction(const Vec3& unit) const {
         Rows3<6> result = Rows3<6>::Zero();
-        result.leftCols<3>() = -skew(unit);
+        result.leftCols<3>() = m_turn.direction(unit);
         return result;
     }
-    /// other · d²(unit direction of an edge).
     Mat6 direction_curvature(const Vec3& unit, const Vec3& other) const {
         Mat6 result = Mat6::Zero();
-        result.topLeftCorner<3, 3>() = turn_curvature(unit, other);
+        result.topLeftCorner<3, 3>() = m_turn.direction_curvature(unit, other);
         return result;
     }
 
 private:
-    Vec3 m_arm;
+    TurnMotion m_turn;
 };
 
 /// The same for the nodes of a cloth's feature.
 class ClothMotion {
 public:
     static constexpr int kSize = 9;
+    static constexpr int kSlideSize = 9;
     ClothMotion(const ClothSide& side, const Vec3&) : m_side(side) {}
 
     Vector<9> row(const Vec3& n) const { return weighted(m_side.weights, n); }
-    Rows3<9> point() const {
-        Rows3<9> result;
-        result << m_side.weights[0] * Mat3::Identity(), m_side.weights[1] * Mat3::Identity(),
-            m_side.weights[2] * Mat3::Identity();
-        return result;
-    }
-    Square<9> point_curvature(const Vec3&) const { return Square<9>::Zero(); }
+    template <class Block>
+    void add_point_curvature(const Vec3&, double, Block&&) const {}
     Vector<9> slide(int k, const Vec3&, const Vec3& n) const { return weighted(m_side.slide[k], n); }
     Rows3<9> direction(const Vec3& unit) const {
         const Mat3 projector = (Mat3::Identity() - unit * unit.transpose()) / m_side.edge_length;
@@ -111,77 +122,81 @@ private:
 BodyMotion motion_of(const BodySide& side, const Vec3& point) { return {side, point}; }
 ClothMotion motion_of(const ClothSide& side, const Vec3& point) { return {side, point}; }
 
-/// The directions in which the closest points slide, as motions of their offset w = point_a - point_b, and how the
-/// coordinates change them along n.
-template <int N>
-struct Slides {
-    int count = 0;
-    std::array<Vec3, 2> direction;    ///< dw/ds
-    std::array<Vector<N>, 2> change;  ///< n · d(dw/ds)/d(coordinates)
-};
-
+/// direction · d(point_a - point_b).
 template <class A, class B>
-Slides<A::kSize + B::kSize> collect_slides(const ContactGeometry& geometry, const A& a, const B& b) {
-    constexpr int kSize = A::kSize + B::kSize;
-    const ClosestPoints& points = geometry.closest;
-    Slides<kSize> slides;
-    for (int k = 0; k < points.slide_count_a; ++k) {
-        slides.direction[slides.count] = points.slide_a[k];
-        slides.change[slides.count] << a.slide(k, points.slide_a[k], geometry.normal), Vector<B::kSize>::Zero();
-        ++slides.count;
-    }
-    for (int k = 0; k < points.slide_count_b; ++k) {
-        slides.direction[slides.count] = -points.slide_b[k];
-        slides.change[slides.count] << Vector<A::kSize>::Zero(), -b.slide(k, points.slide_b[k], geometry.normal);
-        ++slides.count;
-    }
-    return slides;
+Vector<A::kSize + B::kSize> relative_row(const A& a, const B& b, const Vec3& direction) {
+    Vector<A::kSize + B::kSize> row;
+    row << a.row(direction), -b.row(direction);
+    return row;
 }
 
-/// Second derivative of the distance d = min over the slides s of |w(y, s)|. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹,
-/// q = n · dS/dy, and N the projector on what is orthogonal to S and n:
+/// Add factor * r rᵀ.
+template <int N>
+void add_square(const Vector<N>& r, double factor, Square<N>& hessian) {
+    hessian.noalias() += (factor * r) * r.transpose();
+}
+
+/// Add r qᵀ + q rᵀ, q being zero but for the coordinates from `first` on.
+template <int N, int M>
+void add_symmetric(const Vector<N>& r, const Vector<M>& q, int first, Square<N>& hessian) {
+    const Eigen::Matrix<double, N, M> product = r * q.transpose();
+    hessian.template middleCols<M>(first) += product;
+    hessian.template middleRows<M>(first) += product.transpose();
+}
+
+/// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|. With W = dw/dy,
+/// S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is orthogonal to S and n:
 ///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy²  =  WᵀNW/d - X - Xᵀ + n · d²w/dy²,  X = (SᵀW + ½ d q)ᵀ G q.
-/// Products of these sizes are written out: what Eigen would call for them is made for large matrices, and allocates.
+/// A slide of one object changes its direction with the coordinates of that object alone.
 template <class A, class B>
-Square<A::kSize + B::kSize> distance_hessian(const ContactGeometry& geometry, const A& a, const B& b) {
+void add_distance_hessian(
+    const ContactGeometry& geometry, const A& a, const B& b, double factor, Square<A::kSize + B::kSize>& hessian) {
     constexpr int kSize = A::kSize + B::kSize;
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
-    Rows3<kSize> W;
-    W << a.point(), -b.point();
+    const ClosestPoints& points = geometry.closest;
+    a.add_point_curvature(n, factor, hessian.template topLeftCorner<A::kSize, A::kSize>());
+    b.add_point_curvature(n, -factor, hessian.template bottomRightCorner<B::kSize, B::kSize>());
 
-    Square<kSize> hessian = Square<kSize>::Zero();
-    hessian.template topLeftCorner<A::kSize, A::kSize>() = a.point_curvature(n);
-    hessian.template bottomRightCorner<B::kSize, B::kSize>() = -b.point_curvature(n);
-
-    const Slides<kSize> slides = collect_slides(geometry, a, b);
-    if (slides.count == 0) {
-        const Mat3 N = Mat3::Identity() - n * n.transpose();
-        const Rows3<kSize> NW = N * W;
-        hessian.noalias() += W.transpose().lazyProduct(NW / d);
-        return hessian;
+    const int count_a = points.slide_count_a, count = count_a + points.slide_count_b;
+    if (count == 0) {
+        const Vec3 tangent = n.unitOrthogonal();
+        add_square(relative_row(a, b, tangent), factor / d, hessian);
+        add_square(relative_row(a, b, n.cross(tangent)), factor / d, hessian);
+        return;
     }
-    Eigen::Matrix<double, 2, kSize> q = Eigen::Matrix<double, 2, kSize>::Zero();
-    Eigen::Matrix<double, 2, kSize> SW = Eigen::Matrix<double, 2, kSize>::Zero();
-    for (int k = 0; k < slides.count; ++k) {
-        q.row(k) = slides.change[k];
-        SW.row(k) = slides.direction[k].transpose() * W;
+    std::array<Vec3, 2> S;
+    std::array<Vector<A::kSlideSize>, 2> q_a;
+    std::array<Vector<B::kSlideSize>, 2> q_b;
+    Eigen::Matrix<double, kSize, 2> P = Eigen::Matrix<double, kSize, 2>::Zero();  // its columns SᵀW + ½ d q
+    for (int k = 0; k < count; ++k) {
+        if (k < count_a) {
+            S[k] = points.slide_a[k];
+            q_a[k] = a.slide(k, S[k], n);
+            P.col(k) = relative_row(a, b, S[k]);
+            P.col(k).template head<A::kSlideSize>() += 0.5 * d * q_a[k];
+        } else {
+            S[k] = -points.slide_b[k - count_a];
+            q_b[k] = -b.slide(k - count_a, points.slide_b[k - count_a], n);
+            P.col(k) = relative_row(a, b, S[k]);
+            P.col(k).template segment<B::kSlideSize>(A::kSize) += 0.5 * d * q_b[k];
+        }
     }
     Eigen::Matrix2d G = Eigen::Matrix2d::Identity();
-    if (slides.count == 1) {
-        const Vec3 binormal = n.cross(slides.direction[0]);
-        const Eigen::Matrix<double, 1, kSize> BW = binormal.transpose() * W;
-        hessian.noalias() += (BW / d).transpose().lazyProduct(BW);
-    } else {
-        const double g = slides.direction[0].dot(slides.direction[1]);
-        const double determinant = slides.direction[0].cross(slides.direction[1]).squaredNorm();
+    if (count == 1) {
+        add_square(relative_row(a, b, n.cross(S[0])), factor / d, hessian);
+    } else if (count_a == 1) {  // one of each edge; those of a patch are orthonormal
+        const double g = S[0].dot(S[1]);
         G << 1.0, -g, -g, 1.0;
-        G /= determinant;
+        G /= S[0].cross(S[1]).squaredNorm();
     }
-    const Eigen::Matrix<double, 2, kSize> P = SW + 0.5 * d * q, Gq = G * q;
-    const Square<kSize> X = P.transpose().lazyProduct(Gq);
-    hessian -= X + X.transpose();
-    return hessian;
+    for (int k = 0; k < count; ++k) {
+        const Vector<kSize> PG = -factor * (G(0, k) * P.col(0) + G(1, k) * P.col(1));
+        if (k < count_a)
+            add_symmetric(PG, q_a[k], 0, hessian);
+        else
+            add_symmetric(PG, q_b[k], A::kSize, hessian);
+    }
 }
 
 /// The squared sine c = 1 - g² of the angle between two edges, g the cosine, and its derivatives.
@@ -258,10 +273,8 @@ ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, co
 
 template <class A, class B>
 Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, const A& a, const B& b) {
-    Vector<A::kSize + B::kSize> row;
-    row << motion_of(a, geometry.closest.point_a).row(geometry.normal),
-        -motion_of(b, geometry.closest.point_b).row(geometry.normal);
-    return row;
+    return relative_row(
+        motion_of(a, geometry.closest.point_a), motion_of(b, geometry.closest.point_b), geometry.normal);
 }
 
 double contact_energy(const ContactGeometry& geometry, const ContactRange& range, double stiffness) {
@@ -273,15 +286,15 @@ double contact_energy(const ContactGeometry& geometry, const ContactRange& range
     return geometry.sine_sq > 0.0 ? edge_mollifier(geometry.sine_sq).value * energy : 0.0;
 }
 
+namespace {
+
 template <class A, class B>
-ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& side_a, const B& side_b,
+ContactDerivatives<A::kSize + B::kSize> derivatives_along(
+    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
     bool with_hessian, bool with_curvature) {
     constexpr int kSize = A::kSize + B::kSize;
-    const auto a = motion_of(side_a, geometry.closest.point_a);
-    const auto b = motion_of(side_b, geometry.closest.point_b);
     ContactDerivatives<kSize> result;
-    result.row << a.row(geometry.normal), -b.row(geometry.normal);
+    result.row = relative_row(a, b, geometry.normal);
     const PotentialValue potential =
         contact_potential(range.rest - geometry.distance, range.rest - range.pole, stiffness);
     const bool mollified = geometry.sine_sq < kParallelLimit;
@@ -295,9 +308,9 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
         result.gradient += potential.energy * mollifier.first * angle.gradient;
     }
     if (!with_hessian) return result;
-    result.hessian = result.stiffness * (result.row * result.row.transpose());
+    result.hessian.noalias() = (result.stiffness * result.row) * result.row.transpose();
     if (!with_curvature) return result;
-    if (result.force != 0.0) result.hessian -= result.force * distance_hessian(geometry, a, b);
+    if (result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, result.hessian);
     if (mollified) {
         const Square<kSize> cross = result.row * angle.gradient.transpose();
         result.hessian -= potential.force * mollifier.first * (cross + cross.transpose());
@@ -307,6 +320,43 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     return result;
 }
 
+/// From (turn of a, turn of b, shift of b) to both twists: a shift of a is the opposite shift of b.
+ContactDerivatives<12> both_twists(const ContactDerivatives<9>& relative, bool with_hessian) {
+    constexpr std::array<int, 4> kFrom = {0, 6, 3, 6};  // where the turns and shifts of a and of b come from
+    constexpr std::array<double, 4> kSign = {1.0, -1.0, 1.0, 1.0};
+    ContactDerivatives<12> result;
+    result.force = relative.force;
+    result.stiffness = relative.stiffness;
+    for (int i = 0; i < 4; ++i) {
+        result.row.segment<3>(3 * i) = kSign[i] * relative.row.segment<3>(kFrom[i]);
+        result.gradient.segment<3>(3 * i) = kSign[i] * relative.gradient.segment<3>(kFrom[i]);
+        if (!with_hessian) continue;
+        for (int j = 0; j < 4; ++j)
+            result.hessian.block<3, 3>(3 * i, 3 * j) =
+                kSign[i] * kSign[j] * relative.hessian.block<3, 3>(kFrom[i], kFrom[j]);
+    }
+    return result;
+}
+
+}  // namespace
+
+template <class A, class B>
+ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
+    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& side_a, const B& side_b,
+    bool with_hessian, bool with_curvature) {
+    const Vec3 &point_a = geometry.closest.point_a, &point_b = geometry.closest.point_b;
+    if constexpr (std::is_same_v<A, BodySide> && std::is_same_v<B, BodySide>)
+        return both_twists(
+            derivatives_along(
+                geometry, range, stiffness, TurnMotion(side_a, point_a), BodyMotion(side_b, point_b), with_hessian,
+                with_curvature),
+            with_hessian);
+    else
+        return derivatives_along(
+            geometry, range, stiffness, motion_of(side_a, point_a), motion_of(side_b, point_b), with_hessian,
+            with_curvature);
+}
+
 GroundDerivatives ground_derivatives(
     double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_curvature) {
     const PotentialValue potential = contact_potential(range.rest - height, range.rest - range.pole, stiffness);
@@ -314,7 +364,9 @@ GroundDerivatives ground_derivatives(
     result.force = potential.force;
     result.stiffness = potential.stiffness;
     result.row << arm.y(), -arm.x(), 0.0, 0.0, 0.0, 1.0;
-    result.hessian.noalias() = (potential.stiffness * result.row) * result.row.transpose();
+    result.hessian.setZero();
+    for (int i : {0, 1, 5})
+        for (int j : {0, 1, 5}) result.hessian(i, j) = potential.stiffness * result.row[i] * result.row[j];
     if (with_curvature) result.hessian.topLeftCorner<3, 3>() -= potential.force * turn_curvature(arm, Vec3::UnitZ());
     return result;
 }
