@@ -34,34 +34,18 @@ Box node_box(const SweptMesh& swept, int node) {
     return swept.tree != nullptr ? swept.tree->nodes[node].box : swept_box_of(swept.mesh->tree.nodes[node].box, swept);
 }
 
-/// Boxes around a mesh's swept features. Of a deforming mesh, most of whose vertices are asked for many times, those of
-/// the vertices are made at once.
-class FeatureBoxes {
-public:
-    explicit FeatureBoxes(const SweptMesh& swept) : m_swept(swept) {
-        if (swept.begin == nullptr) return;
-        const int count = static_cast<int>(swept.mesh->vertices.size());
-        m_vertices.reserve(swept.mesh->vertices.size());
-        for (int v = 0; v < count; ++v) m_vertices.push_back(vertex_box(swept, v));
-    }
+Box edge_box(const SweptBoxes& boxes, int edge) {
+    const Edge& ends = boxes.swept().mesh->edges[edge];
+    Box box = boxes.vertex(ends.p0);
+    box.include(boxes.vertex(ends.p1));
+    return box;
+}
 
-    const SweptMesh& swept() const { return m_swept; }
-    Box vertex(int v) const { return m_vertices.empty() ? vertex_box(m_swept, v) : m_vertices[v]; }
-    Box edge(int edge) const {
-        Box box = vertex(m_swept.mesh->edges[edge].p0);
-        box.include(vertex(m_swept.mesh->edges[edge].p1));
-        return box;
-    }
-    Box patch(int patch) const {
-        Box box;
-        for (int v : m_swept.mesh->patches[patch].vertices) box.include(vertex(v));
-        return box;
-    }
-
-private:
-    const SweptMesh& m_swept;
-    std::vector<Box> m_vertices;
-};
+Box patch_box(const SweptBoxes& boxes, int patch) {
+    Box box;
+    for (int v : boxes.swept().mesh->patches[patch].vertices) box.include(boxes.vertex(v));
+    return box;
+}
 
 /// Whether vertices of a cell are to be held against a patch. A sphere's or capsule's patch has no area: the edges
 /// of a mesh cover it, and of two such bodies the vertices of the one with the smaller patch do.
@@ -74,11 +58,11 @@ bool patch_counts(const Patch& own, const Patch& other, ContactType type) {
 
 /// Vertices of one cell against the patch of the other.
 void pair_vertices(
-    const FeatureBoxes& a, const Cell& cell_a, const FeatureBoxes& b, const Cell& cell_b, ContactType type,
+    const SweptBoxes& a, const Cell& cell_a, const SweptBoxes& b, const Cell& cell_b, ContactType type,
     std::vector<FeaturePair>& pairs) {
     if (cell_a.vertices.empty()) return;
     if (!patch_counts(a.swept().mesh->patches[cell_a.patch], b.swept().mesh->patches[cell_b.patch], type)) return;
-    const Box box_b = b.patch(cell_b.patch);
+    const Box box_b = patch_box(b, cell_b.patch);
     for (int v : cell_a.vertices) {
         if (!a.vertex(v).overlaps(box_b)) continue;
         if (type == ContactType::vertex_patch)
@@ -89,44 +73,43 @@ void pair_vertices(
 }
 
 void pair_cells(
-    const FeatureBoxes& a, const Cell& cell_a, const FeatureBoxes& b, const Cell& cell_b,
-    std::vector<FeaturePair>& pairs) {
+    const SweptBoxes& a, const Cell& cell_a, const SweptBoxes& b, const Cell& cell_b, std::vector<FeaturePair>& pairs) {
     pair_vertices(a, cell_a, b, cell_b, ContactType::vertex_patch, pairs);
     pair_vertices(b, cell_b, a, cell_a, ContactType::patch_vertex, pairs);
     for (int ea : cell_a.edges) {
-        const Box box_a = a.edge(ea);
+        const Box box_a = edge_box(a, ea);
         for (int eb : cell_b.edges)
-            if (box_a.overlaps(b.edge(eb))) pairs.push_back({ContactType::edge_edge, ea, eb});
+            if (box_a.overlaps(edge_box(b, eb))) pairs.push_back({ContactType::edge_edge, ea, eb});
     }
 }
 
 /// Calls visit_cells(cell_a, cell_b) for all pairs of cells whose swept boxes overlap.
 template <typename VisitCells>
 struct TreePairing {
-    const SweptMesh& a;
-    const SweptMesh& b;
+    const SweptBoxes& a;
+    const SweptBoxes& b;
     const VisitCells& visit_cells;
 
-    void visit(int node_a, const Box& box_a, int node_b, const Box& box_b) {
-        if (!box_a.overlaps(box_b)) return;
-        const BoxTree::Node& na = tree_of(a).nodes[node_a];
-        const BoxTree::Node& nb = tree_of(b).nodes[node_b];
+    void visit(int node_a, int node_b) {
+        if (!a.node(node_a).overlaps(b.node(node_b))) return;
+        const BoxTree::Node& na = tree_of(a.swept()).nodes[node_a];
+        const BoxTree::Node& nb = tree_of(b.swept()).nodes[node_b];
         if (na.is_leaf() && nb.is_leaf()) {
-            visit_cells(a.mesh->cells[na.item], b.mesh->cells[nb.item]);
+            visit_cells(a.swept().mesh->cells[na.item], b.swept().mesh->cells[nb.item]);
         } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
-            visit(na.left, node_box(a, na.left), node_b, box_b);
-            visit(na.right, node_box(a, na.right), node_b, box_b);
+            visit(na.left, node_b);
+            visit(na.right, node_b);
         } else {
-            visit(node_a, box_a, nb.left, node_box(b, nb.left));
-            visit(node_a, box_a, nb.right, node_box(b, nb.right));
+            visit(node_a, nb.left);
+            visit(node_a, nb.right);
         }
     }
 };
 
 template <typename VisitCells>
-void for_each_cell_pair(const SweptMesh& a, const SweptMesh& b, const VisitCells& visit_cells) {
-    if (a.mesh->tree.empty() || b.mesh->tree.empty()) return;
-    TreePairing<VisitCells>{a, b, visit_cells}.visit(0, swept_box(a), 0, swept_box(b));
+void for_each_cell_pair(const SweptBoxes& a, const SweptBoxes& b, const VisitCells& visit_cells) {
+    if (a.swept().mesh->tree.empty() || b.swept().mesh->tree.empty()) return;
+    TreePairing<VisitCells>{a, b, visit_cells}.visit(0, 0);
 }
 
 /// Calls visit_cells(cell_a, cell_b) for all pairs of different cells of one mesh whose swept boxes overlap.
@@ -326,11 +309,11 @@ void drop_distant_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<Feat
 
 BoxTree refitted_tree(const SweptMesh& swept) {
     BoxTree tree = swept.mesh->tree;
-    const FeatureBoxes boxes(swept);
+    const SweptBoxes boxes(swept);
     for (std::size_t k = tree.nodes.size(); k-- > 0;) {  // children follow their parents
         BoxTree::Node& node = tree.nodes[k];
         if (node.is_leaf()) {
-            node.box = boxes.patch(swept.mesh->cells[node.item].patch);
+            node.box = patch_box(boxes, swept.mesh->cells[node.item].patch);
         } else {
             node.box = tree.nodes[node.left].box;
             node.box.include(tree.nodes[node.right].box);
@@ -341,14 +324,35 @@ BoxTree refitted_tree(const SweptMesh& swept) {
 
 Box swept_box(const SweptMesh& swept) { return node_box(swept, 0); }
 
-void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs) {
-    const FeatureBoxes boxes_a(a), boxes_b(b);
-    for_each_cell_pair(
-        a, b, [&](const Cell& cell_a, const Cell& cell_b) { pair_cells(boxes_a, cell_a, boxes_b, cell_b, pairs); });
+void SweptBoxes::assign(const SweptMesh& swept) {
+    m_swept = swept;
+    const std::size_t vertex_count = swept.mesh->vertices.size(), node_count = swept.mesh->tree.nodes.size();
+    if (m_vertices.size() < vertex_count) m_vertices.resize(vertex_count);
+    if (m_nodes.size() < node_count) m_nodes.resize(node_count);
+    m_vertex_made.assign(vertex_count, 0);
+    m_node_made.assign(node_count, 0);
+}
+
+const Box& SweptBoxes::vertex(int v) const {
+    const auto k = static_cast<std::size_t>(v);
+    if (!m_vertex_made[k]) m_vertices[k] = vertex_box(m_swept, v);
+    m_vertex_made[k] = 1;
+    return m_vertices[k];
+}
+
+const Box& SweptBoxes::node(int n) const {
+    const auto k = static_cast<std::size_t>(n);
+    if (!m_node_made[k]) m_nodes[k] = node_box(m_swept, n);
+    m_node_made[k] = 1;
+    return m_nodes[k];
+}
+
+void collect_feature_pairs(const SweptBoxes& a, const SweptBoxes& b, std::vector<FeaturePair>& pairs) {
+    for_each_cell_pair(a, b, [&](const Cell& cell_a, const Cell& cell_b) { pair_cells(a, cell_a, b, cell_b, pairs); });
 }
 
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs) {
-    const FeatureBoxes boxes(swept);
+    const SweptBoxes boxes(swept);
     for_each_own_cell_pair(swept, [&](const Cell& cell_a, const Cell& cell_b) {
         const auto first = static_cast<std::ptrdiff_t>(pairs.size());
         pair_cells(boxes, cell_a, boxes, cell_b, pairs);

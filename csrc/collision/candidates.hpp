@@ -24,6 +24,25 @@ struct SweptMesh {
     const BoxTree* tree = nullptr;
 };
 
+/// A mesh in motion with boxes around its vertices and the nodes of its tree. Each is made when first asked for, and serves
+/// all pairs with the mesh.
+class SweptBoxes {
+public:
+    SweptBoxes() = default;
+    SweptBoxes(const SweptMesh& swept) { assign(swept); }
+
+    /// Start anew with another mesh or motion, in the same memory.
+    void assign(const SweptMesh& swept);
+    const SweptMesh& swept() const { return m_swept; }
+    const Box& vertex(int v) const;
+    const Box& node(int n) const;
+
+private:
+    SweptMesh m_swept{};
+    mutable std::vector<Box> m_vertices, m_nodes;
+    mutable std::vector<char> m_vertex_made, m_node_made;
+};
+
 enum class ContactType : std::uint8_t { vertex_patch, patch_vertex, edge_edge };
 
 /// A pair of features that may come near each other: vertex of a and patch of b, patch of a and vertex of b,
@@ -40,7 +59,7 @@ BoxTree refitted_tree(const SweptMesh& swept);
 Box swept_box(const SweptMesh& swept);
 
 /// Append every feature pair whose swept boxes overlap, in an order that depends on the meshes alone.
-void collect_feature_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
+void collect_feature_pairs(const SweptBoxes& a, const SweptBoxes& b, std::vector<FeaturePair>& pairs);
 
 /// The same within one deforming mesh; features that share a vertex do not count.
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs);

@@ -144,8 +144,9 @@ public:
           m_coverage(coverage),
           m_meshes(coverage.scratch.meshes),
           m_boxes(coverage.scratch.boxes),
-          m_vertices(coverage.scratch.vertices),
+          m_feature_boxes(coverage.scratch.feature_boxes),
           m_features(coverage.scratch.features) {}
+          m_vertices(coverage.scratch.vertices),
 
     void run() {
         m_zone.contacts.clear();
@@ -229,10 +230,12 @@ private:
     }
 
     void list_pairs() {
+        if (m_feature_boxes.size() < m_meshes.size()) m_feature_boxes.resize(m_meshes.size());
+        for (std::size_t i = 0; i < m_meshes.size(); ++i) m_feature_boxes[i].assign(m_meshes[i]);
         for (const auto& [i, j] : overlapping_pairs(m_boxes)) {
             if (!yields(i) && !yields(j)) continue;
             m_features.clear();
-            collect_feature_pairs(m_meshes[i], m_meshes[j], m_features);
+            collect_feature_pairs(m_feature_boxes[i], m_feature_boxes[j], m_features);
             if (j >= m_zone.body_count()) drop_distant_pairs(m_meshes[i], m_meshes[j], m_features);
             if (m_features.empty()) continue;
             const std::size_t first = m_zone.contacts.size();
@@ -266,6 +269,7 @@ private:
     ContactCoverage& m_coverage;
     std::vector<SweptMesh>& m_meshes;
     std::vector<Box>& m_boxes;
+    std::vector<SweptBoxes>& m_feature_boxes;
     std::vector<int>& m_vertices;
     std::vector<FeaturePair>& m_features;
     std::vector<SweptCloth> m_cloths;

@@ -15,6 +15,7 @@ struct ContactCoverage {
     struct Scratch {
         std::vector<SweptMesh> meshes;
         std::vector<Box> boxes;
+        std::vector<SweptBoxes> feature_boxes;
         std::vector<int> vertices;
         std::vector<FeaturePair> features;
     } scratch;

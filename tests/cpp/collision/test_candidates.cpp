@@ -257,7 +257,7 @@ TEST(candidates_are_about_as_few_as_they_can_be) {
     const CollisionMesh cube = fixtures::collision_mesh(fixtures::box(Vec3(1, 1, 1)));
     const Pose above{Mat3::Identity(), Vec3(0, 0, 2.1)};
     std::vector<FeaturePair> pairs;
-    collect_feature_pairs({&cube, {Pose(), Pose()}, 0.06}, {&cube, {above, above}, 0.06}, pairs);
+    collect_feature_pairs(SweptMesh{&cube, {Pose(), Pose()}, 0.06}, SweptMesh{&cube, {above, above}, 0.06}, pairs);
     int faces = 0;
     for (const FeaturePair& p : pairs) {
         if (p.type == ContactType::vertex_patch) {
@@ -273,7 +273,7 @@ TEST(candidates_are_about_as_few_as_they_can_be) {
     CHECK(faces == 4);
     pairs.clear();
     const Pose far{Mat3::Identity(), Vec3(0, 0, 2.2)};
-    collect_feature_pairs({&cube, {Pose(), Pose()}, 0.06}, {&cube, {far, far}, 0.06}, pairs);
+    collect_feature_pairs(SweptMesh{&cube, {Pose(), Pose()}, 0.06}, SweptMesh{&cube, {far, far}, 0.06}, pairs);
     CHECK(pairs.empty());
 }
 
@@ -282,7 +282,7 @@ TEST(points_and_segments_meet_each_other_once) {
     const auto count = [&](const CollisionMesh& a, const CollisionMesh& b) {
         std::vector<FeaturePair> pairs;
         const Pose crossed{exp_rotation(Vec3(0, 0, 1.2)), Vec3(0.1, 0, 0.2)};
-        collect_feature_pairs({&a, {Pose(), Pose()}, 0.2}, {&b, {crossed, crossed}, 0.2}, pairs);
+        collect_feature_pairs(SweptMesh{&a, {Pose(), Pose()}, 0.2}, SweptMesh{&b, {crossed, crossed}, 0.2}, pairs);
         CHECK(keys(pairs).size() == pairs.size());
         return pairs.size();
     };
