@@ -323,10 +323,8 @@ namespace {
 /// Bounds on how far vertices of objects move, common motion of a cloth with itself left out.
 class MotionBounds {
 public:
-    MotionBounds(const Zone& zone, const ZonePoint& point, const Coordinates& y_end) : m_zone(zone) {
-        m_bodies.reserve(zone.bodies.size());
-        for (int i = 0; i < zone.body_count(); ++i)
-            m_bodies.push_back(motion_bound(y_end.bodies[i] - point.y.bodies[i], zone.mesh(i).radius));
+    MotionBounds(const Zone& zone, const ZonePoint& point, const Coordinates& y_end)
+        : m_zone(zone), m_begin(point.y), m_end(y_end) {
         for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
             const int first = zone.cloths[c].first_node, count = zone.cloth(c).node_count();
             const Vec3 mean = mean_motion(zone.cloths[c], count, point.y, y_end);
@@ -338,14 +336,26 @@ public:
         }
     }
 
-    double approach(const ZoneContact& contact) const {
+    /// Contacts of the same two objects stand one after the other: of bodies the bound is found once for all of them.
+    double approach(const ZoneContact& contact) {
+        if (contact.cloth_a < 0 && contact.cloth_b < 0) {
+            if (contact.a != m_last_a || contact.b != m_last_b) {
+                m_last_a = contact.a;
+                m_last_b = contact.b;
+                m_last = body(contact.a) + (contact.contact.with_ground() ? 0.0 : body(contact.b));
+            }
+            return m_last;
+        }
         const bool self = contact.contact.object_a == contact.contact.object_b;
         return of(contact, true, self) + (contact.contact.with_ground() ? 0.0 : of(contact, false, self));
     }
 
 private:
+    double body(int index) const {
+        return motion_bound(m_end.bodies[index] - m_begin.bodies[index], m_zone.mesh(index).radius);
+    }
     double of(const ZoneContact& contact, bool of_a, bool self) const {
-        if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) return m_bodies[of_a ? contact.a : contact.b];
+        if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) return body(of_a ? contact.a : contact.b);
         double bound = 0.0;
         for (int node : feature_nodes(m_zone, contact, of_a))
             if (node >= 0) bound = std::max(bound, (self ? m_uneven : m_nodes)[node]);
@@ -353,7 +363,27 @@ private:
     }
 
     const Zone& m_zone;
-    std::vector<double> m_bodies, m_nodes, m_uneven;
+    const Coordinates &m_begin, &m_end;
+    std::vector<double> m_nodes, m_uneven;
+    int m_last_a = kNobody, m_last_b = kNobody;
+    double m_last = 0.0;
+};
+
+/// Where everything is at the end of a motion; found when first asked for, since most motions bring no pair near.
+class MotionEnd {
+public:
+    MotionEnd(const Zone& zone, const Coordinates& y) : m_zone(zone), m_y(y) {}
+
+    Surface surface(const ZoneContact& contact, bool of_a) {
+        if (m_poses.empty() && m_nodes.empty()) place(m_zone, m_y, m_poses, m_nodes);
+        return of_a ? surface_a(m_zone, contact, m_poses, m_nodes) : surface_b(m_zone, contact, m_poses, m_nodes);
+    }
+
+private:
+    const Zone& m_zone;
+    const Coordinates& m_y;
+    std::vector<Pose> m_poses;
+    std::vector<Vec3> m_nodes;
 };
 
 }  // namespace
@@ -363,10 +393,8 @@ double allowed_step(
     Clearance clearance) {
     if (impacts != nullptr) impacts->clear();
     if (zone.contacts.empty()) return 1.0;
-    const MotionBounds motion(zone, point, y_end);
-    std::vector<Pose> poses_end;
-    std::vector<Vec3> nodes_end;
-    place(zone, y_end, poses_end, nodes_end);
+    MotionBounds motion(zone, point, y_end);
+    MotionEnd end(zone, y_end);
     double step = 1.0;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
@@ -379,10 +407,8 @@ double allowed_step(
         ccd.tolerance = 0.2 * keep;
         if (motion.approach(contact) < room - 1.2 * keep) continue;
         const double toi = contact_toi(
-            contact.contact,
-            {surface_a(zone, contact, point.poses, point.nodes), surface_a(zone, contact, poses_end, nodes_end)},
-            {surface_b(zone, contact, point.poses, point.nodes), surface_b(zone, contact, poses_end, nodes_end)},
-            zone.ground_height, ccd);
+            contact.contact, {surface_a(zone, contact, point.poses, point.nodes), end.surface(contact, true)},
+            {surface_b(zone, contact, point.poses, point.nodes), end.surface(contact, false)}, zone.ground_height, ccd);
         if (toi == kNoImpact) continue;
         step = std::min(step, toi);
         if (impacts != nullptr) impacts->push_back({static_cast<int>(k), toi});
