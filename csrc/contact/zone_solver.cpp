@@ -297,6 +297,7 @@ private:
     /// Backtrack along the way to y_end until the energy falls. At rest its fall drowns in rounding: there the slope
     /// tells. False if no step does.
     bool line_search(double first_step) {
+        m_trial_is_differentiated = false;
         const double slope0 = slope(m_w.derivatives.gradient);
         const double noise = energy_noise();
         double step = first_step;
@@ -312,18 +313,26 @@ private:
             if (change <= noise) {
                 differentiate(m_zone, m_w.trial, Curvature::none, m_w.trial_derivatives, nullptr);
                 const double slope1 = std::abs(slope(m_w.trial_derivatives.gradient));
-                if (slope1 <= std::max(0.9 * std::abs(slope0), noise)) return true;
+                if (slope1 <= std::max(0.9 * std::abs(slope0), noise)) {
+                    m_trial_is_differentiated = true;
+                    return true;
+                }
             }
         }
         return false;
     }
 
-    /// Whether the gradient alone says that a cloth's Newton step reached the minimum. If so, takes the step past the
-    /// tolerance with the factor at hand: the next one would only show the same.
+    /// Whether the gradient alone says that a Newton step reached the minimum. If so, takes the step past the tolerance with
+    /// the factor at hand: the next one would only show the same. The gradient is worth its price where factors are dear,
+    /// with cloth, and where the line search has it anyway.
     bool finish_with_this_factor() {
-        if (m_zone.nodes.empty() || !m_zone.elastic || !m_factor_is_exact) return false;
+        const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
+        if (!m_factor_is_exact || !(with_cloth || m_trial_is_differentiated)) return false;
         const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
-        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        if (m_trial_is_differentiated)
+            std::swap(m_w.derivatives, m_w.trial_derivatives);
+        else
+            differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
         m_w.derivatives.largest_stiffness = stiffness;
         const Accuracy now = accuracy();
         if (!(now.residual < std::max(m_options.tolerance, now.floor)) || !solve_for_step()) return false;
@@ -376,7 +385,10 @@ private:
             // here, so energy and derivatives stand.
             ensure_covered(m_w.y_end);
             double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
-            step = driven && step < kClampedStep ? past_impacts(step, true) : arc_step(step);
+            if (driven && step < kClampedStep)
+                step = past_impacts(step, true);
+            else if (step < 1.0 || !gates_hold(m_gates, m_zone, m_w.y_end))
+                step = arc_step(step);
             if (line_search(step)) {
                 accept_trial();
                 const bool is_last = m_result.iterations + 1 >= m_options.max_iterations;
@@ -502,10 +514,11 @@ private:
     std::vector<Box>& m_visited;
     ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
-    double m_position = 0.0;         // size of the numbers that distances are differences of [m]
-    CutShare m_cut = kNothingCut;    // of the next Newton step
-    bool m_factor_is_exact = false;  // the system's, of the exact Hessian
-    bool m_rescue = false;           // some objects start the step below their floor
+    double m_position = 0.0;                 // size of the numbers that distances are differences of [m]
+    CutShare m_cut = kNothingCut;            // of the next Newton step
+    bool m_factor_is_exact = false;          // the system's, of the exact Hessian
+    bool m_trial_is_differentiated = false;  // the one that the line search accepted
+    bool m_rescue = false;                   // some objects start the step below their floor
     ZoneResult m_result;
 };
 
