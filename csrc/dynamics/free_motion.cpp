@@ -18,16 +18,16 @@ constexpr int kMaxNewtonSteps = 30;
 
 struct Substep {
     Vec3 angular_velocity;
-    Mat3 R1;
+    Mat3 turn, R1;       ///< R1 = turn R0 at its end
     Mat3 inertia_world;  ///< at R1
     bool converged = false;
 };
 
-/// d(I(R1) w)/dw with R1 = Exp(dt w) R0.
-Mat3 momentum_jacobian(const Substep& substep, double dt) {
+/// d(I(R1) w)/dw with R1 = Exp(dt w) R0, given the left Jacobian at dt w.
+Mat3 momentum_jacobian(const Substep& substep, double dt, const Mat3& jacobian) {
     const Vec3& w = substep.angular_velocity;
     const Mat3& inertia = substep.inertia_world;
-    return inertia + dt * (inertia * skew(w) - skew(inertia * w)) * left_jacobian(dt * w);
+    return inertia + dt * (inertia * skew(w) - skew(inertia * w)) * jacobian;
 }
 
 /// Newton's method on I(Exp(dt w) R0) w = momentum from the guess w, run until rounding stops it.
@@ -39,7 +39,8 @@ Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, c
     for (int k = 0; k < kMaxNewtonSteps; ++k) {
         Substep trial;
         trial.angular_velocity = w;
-        trial.R1 = exp_rotation(dt * w) * R0;
+        trial.turn = exp_rotation(dt * w);
+        trial.R1 = trial.turn * R0;
         trial.inertia_world = trial.R1 * inertia_body * trial.R1.transpose();
         const Vec3 residual = trial.inertia_world * w - momentum;
         const double norm = residual.norm();
@@ -47,7 +48,7 @@ Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, c
         best = trial;
         best_residual = norm;
         if (norm <= 0.5 * kEpsilon * momentum.norm()) break;
-        w -= momentum_jacobian(trial, dt).partialPivLu().solve(residual);
+        w -= momentum_jacobian(trial, dt, left_jacobian(dt * w)).partialPivLu().solve(residual);
     }
     best.converged = std::isfinite(best_residual) && best_residual <= 16.0 * kEpsilon * scale &&
                      dt * best.angular_velocity.norm() < 3.0;
@@ -117,20 +118,22 @@ FreeRotationGradient free_rotation_backward(
     }
     const Mat3 inertia0 = R0 * inertia_body * R0.transpose();
     const Vec3 momentum = inertia0 * angular_velocity + dt * torque;
-    std::vector<Substep> substeps;
+    Substep single;  // the one substep of most bodies needs no heap
+    std::vector<Substep> several;
     if (result.substeps == 1) {
-        Substep single;
         single.angular_velocity = result.angular_velocity;
-        single.R1 = exp_rotation(dt * result.angular_velocity) * R0;
+        single.turn = exp_rotation(dt * result.angular_velocity);
+        single.R1 = single.turn * R0;
         single.inertia_world = single.R1 * inertia_body * single.R1.transpose();
-        substeps.push_back(single);
     } else {
         const Vec3 guess = initial_guess(inertia0, angular_velocity, torque, dt);
-        substeps = solve_substeps(R0, guess, momentum, inertia_body, dt, result.substeps);
+        several = solve_substeps(R0, guess, momentum, inertia_body, dt, result.substeps);
+        assert(!several.empty());  // as in the forward
     }
-    assert(!substeps.empty());  // as in the forward
+    const Substep* substeps = several.empty() ? &single : several.data();
+    const std::size_t count = several.empty() ? 1 : several.size();
 
-    const double dt_sub = dt / static_cast<double>(substeps.size());
+    const double dt_sub = dt / static_cast<double>(count);
     Vec3 grad_w = grad_angular_velocity;
     Vec3 covector = Vec3::Zero();  // of the orientation at the end of the substep at hand
     if (result.substeps == 1) {
@@ -141,15 +144,16 @@ FreeRotationGradient free_rotation_backward(
         grad.orientation -= exp_rotation(result.rotation).transpose() * covector;
     }
     Vec3 grad_momentum = Vec3::Zero();
-    for (std::size_t k = substeps.size(); k-- > 0;) {
+    for (std::size_t k = count; k-- > 0;) {
         const Substep& substep = substeps[k];
         const Vec3& w = substep.angular_velocity;
-        const Mat3 turn = exp_rotation(dt_sub * w);
-        grad_w += dt_sub * left_jacobian(dt_sub * w).transpose() * covector;
-        const Vec3 multiplier = momentum_jacobian(substep, dt_sub).transpose().partialPivLu().solve(grad_w);
+        const Mat3 jacobian = left_jacobian(dt_sub * w);
+        grad_w += dt_sub * jacobian.transpose() * covector;
+        const Vec3 multiplier = momentum_jacobian(substep, dt_sub, jacobian).transpose().partialPivLu().solve(grad_w);
         grad_momentum += multiplier;
         if (with_inertia) grad.inertia_body -= inertia_body_gradient(substep.R1, w, multiplier);
-        covector = turn.transpose() * (covector - inertia_rotation_gradient(substep.inertia_world, w, multiplier));
+        covector =
+            substep.turn.transpose() * (covector - inertia_rotation_gradient(substep.inertia_world, w, multiplier));
         grad_w.setZero();
     }
     grad.orientation += covector + inertia_rotation_gradient(inertia0, angular_velocity, grad_momentum);

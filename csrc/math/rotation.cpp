@@ -10,41 +10,48 @@ namespace {
 /// rounding there, while the closed forms lose about eps / angle^4 in their derivatives.
 constexpr double kSeriesAngleSq = 0.04;
 
-/// The scalar functions of the angle t that all the maps above are made of.
-struct AngleFunctions {
-    double a;  ///< sin(t) / t
-    double b;  ///< (1 - cos t) / t^2
-    double c;  ///< (t - sin t) / t^3
-};
+// The scalar functions of the angle t that all the maps above are made of, given t².
 
-AngleFunctions angle_functions(double angle_sq) {
-    if (angle_sq < kSeriesAngleSq) {
-        const double s = angle_sq;
-        return {
-            1.0 + s * (-1.0 / 6 + s * (1.0 / 120 + s * (-1.0 / 5040 + s * (1.0 / 362880 - s / 39916800)))),
-            0.5 + s * (-1.0 / 24 + s * (1.0 / 720 + s * (-1.0 / 40320 + s * (1.0 / 3628800 - s / 479001600)))),
-            1.0 / 6 + s * (-1.0 / 120 + s * (1.0 / 5040 + s * (-1.0 / 362880 + s / 39916800)))};
-    }
-    const double angle = std::sqrt(angle_sq);
-    const double sine = std::sin(angle);
-    return {sine / angle, (1.0 - std::cos(angle)) / angle_sq, (angle - sine) / (angle_sq * angle)};
+/// sin(t) / t
+double sine_function(double s) {
+    if (s < kSeriesAngleSq)
+        return 1.0 + s * (-1.0 / 6 + s * (1.0 / 120 + s * (-1.0 / 5040 + s * (1.0 / 362880 - s / 39916800))));
+    const double angle = std::sqrt(s);
+    return std::sin(angle) / angle;
+}
+
+/// (1 - cos t) / t^2
+double cosine_function(double s) {
+    if (s < kSeriesAngleSq)
+        return 0.5 + s * (-1.0 / 24 + s * (1.0 / 720 + s * (-1.0 / 40320 + s * (1.0 / 3628800 - s / 479001600))));
+    return (1.0 - std::cos(std::sqrt(s))) / s;
+}
+
+/// (t - sin t) / t^3
+double cubic_function(double s) {
+    if (s < kSeriesAngleSq) return 1.0 / 6 + s * (-1.0 / 120 + s * (1.0 / 5040 + s * (-1.0 / 362880 + s / 39916800)));
+    const double angle = std::sqrt(s);
+    return (angle - std::sin(angle)) / (s * angle);
+}
+
+/// I + first [theta]x + second [theta]x²
+Mat3 combine(const Vec3& theta, double first, double second) {
+    Mat3 result = (second * theta) * theta.transpose() + first * skew(theta);
+    result.diagonal().array() += 1.0 - second * theta.squaredNorm();
+    return result;
 }
 
 }  // namespace
 
 Mat3 exp_rotation(const Vec3& theta) {
-    const AngleFunctions f = angle_functions(theta.squaredNorm());
-    const Mat3 k = skew(theta);
-    Mat3 result = f.a * k + f.b * (k * k);
-    result.diagonal().array() += 1.0;
-    return result;
+    const double s = theta.squaredNorm();
+    return combine(theta, sine_function(s), cosine_function(s));
 }
 
 Vec4 exp_quaternion(const Vec3& theta) {
     const double half_angle_sq = 0.25 * theta.squaredNorm();
-    const AngleFunctions half = angle_functions(half_angle_sq);
     Vec4 q;
-    q << std::cos(std::sqrt(half_angle_sq)), 0.5 * half.a * theta;
+    q << std::cos(std::sqrt(half_angle_sq)), 0.5 * sine_function(half_angle_sq) * theta;
     return q / q.norm();
 }
 
@@ -54,17 +61,14 @@ Vec3 log_rotation(const Mat3& rotation) {
 }
 
 Mat3 left_jacobian(const Vec3& theta) {
-    const AngleFunctions f = angle_functions(theta.squaredNorm());
-    const Mat3 k = skew(theta);
-    Mat3 result = f.b * k + f.c * (k * k);
-    result.diagonal().array() += 1.0;
-    return result;
+    const double s = theta.squaredNorm();
+    return combine(theta, cosine_function(s), cubic_function(s));
 }
 
 Mat3 left_jacobian_transposed_derivative(const Vec3& theta, const Vec3& tau) {
     // J^T tau = tau - b theta x tau + c theta x (theta x tau), with b, c functions of |theta|.
     const double s = theta.squaredNorm();
-    const AngleFunctions f = angle_functions(s);
+    const double b = cosine_function(s), c = cubic_function(s);
     double db;  // (db/dangle) / angle
     double dc;  // (dc/dangle) / angle
     if (s < kSeriesAngleSq) {
@@ -72,14 +76,14 @@ Mat3 left_jacobian_transposed_derivative(const Vec3& theta, const Vec3& tau) {
              (1.0 - s / 15.0 * (1.0 - 3.0 * s / 112.0 * (1.0 - 2.0 * s / 135.0 * (1.0 - 5.0 * s / 528.0))));
         dc = -1.0 / 60.0 * (1.0 - s / 21.0 * (1.0 - s / 48.0 * (1.0 - 2.0 * s / 165.0 * (1.0 - 5.0 * s / 624.0))));
     } else {
-        // a = sin/t, so db = (a - 2 b) / t^2 and dc = (b - 3 c) / t^2.
-        db = (f.a - 2.0 * f.b) / s;
-        dc = (f.b - 3.0 * f.c) / s;
+        // With a = sin/t: db = (a - 2 b) / t^2 and dc = (b - 3 c) / t^2.
+        db = (sine_function(s) - 2.0 * b) / s;
+        dc = (b - 3.0 * c) / s;
     }
     const Vec3 once = theta.cross(tau);
     const Vec3 twice = theta.cross(once);
     const Mat3 tau_skew = skew(tau);
-    return f.b * tau_skew - f.c * (skew(once) + skew(theta) * tau_skew) + (dc * twice - db * once) * theta.transpose();
+    return b * tau_skew - c * (skew(once) + skew(theta) * tau_skew) + (dc * twice - db * once) * theta.transpose();
 }
 
 Mat3 quaternion_to_matrix(const Vec4& q) {
