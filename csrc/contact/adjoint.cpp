@@ -138,12 +138,13 @@ private:
     void body_on_ground(
         const ZoneContact& contact, const ActiveContact& active, Curvature curvature, ContactTerm& term) const {
         term.sides[0].body = contact.a;
+        const bool with_hessian = curvature != Curvature::none;
         const GroundDerivatives d = ground_derivatives(
             active.geometry.distance, active.geometry.closest.point_a - m_point.poses[contact.a].t, contact.range,
-            contact.stiffness.value, curvature != Curvature::dropped);
+            contact.stiffness.value, with_hessian, curvature != Curvature::dropped);
         term.row = d.row;
         term.gradient = -d.force * d.row;
-        term.hessian = d.hessian;
+        if (with_hessian) term.hessian = d.hessian;
         term.force = d.force;
         term.stiffness = d.stiffness;
     }

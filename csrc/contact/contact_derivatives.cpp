@@ -358,12 +358,14 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
 }
 
 GroundDerivatives ground_derivatives(
-    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_curvature) {
+    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_hessian,
+    bool with_curvature) {
     const PotentialValue potential = contact_potential(range.rest - height, range.rest - range.pole, stiffness);
     GroundDerivatives result;
     result.force = potential.force;
     result.stiffness = potential.stiffness;
     result.row << arm.y(), -arm.x(), 0.0, 0.0, 0.0, 1.0;
+    if (!with_hessian) return result;
     result.hessian.setZero();
     for (int i : {0, 1, 5})
         for (int j : {0, 1, 5}) result.hessian(i, j) = potential.stiffness * result.row[i] * result.row[j];

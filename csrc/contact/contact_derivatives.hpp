@@ -63,6 +63,7 @@ struct GroundDerivatives {
     double force, stiffness;
 };
 GroundDerivatives ground_derivatives(
-    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_curvature);
+    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_hessian,
+    bool with_curvature);
 
 }  // namespace diffsim

@@ -18,12 +18,15 @@ struct Overloaded : Functions... {
 template <class... Functions>
 Overloaded(Functions...) -> Overloaded<Functions...>;
 
-/// A Hessian without this share of its negative part.
+/// Take this share of its negative part off a Hessian.
 template <int N>
-Square<N> cut_off(const Square<N>& hessian, CutShare cut) {
-    if (cut == kNothingCut) return hessian;
+void cut_off(CutShare cut, Square<N>& hessian) {
+    if (cut == kNothingCut) return;
     const Square<N> part = positive_part<N>(hessian);
-    return cut == kAllCut ? part : Square<N>(hessian + cut * (part - hessian));
+    if (cut == kAllCut)
+        hessian = part;
+    else
+        hessian += cut * (part - hessian);
 }
 
 /// |L⁻¹ g| of one body.
@@ -92,14 +95,20 @@ private:
         m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, stiffness * scale);
     }
 
-    void add_block(const BodyPlace& place, const Mat6& block) { m_system->diagonal(place.body) += block; }
-    void add_block(const ClothPlace& place, const Square<9>& block) {
+    template <class Block>
+    void add_block(const BodyPlace& place, const Block& block) {
+        m_system->diagonal(place.body) += block;
+    }
+    template <class Block>
+    void add_block(const ClothPlace& place, const Block& block) {
         for (int r = 0; r < 3; ++r)
             for (int c = r; c < 3; ++c)
                 if (place.nodes[r] >= 0 && place.nodes[c] >= 0)
-                    add_node_block(m_zone, place.nodes[r], place.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
+                    add_node_block(
+                        m_zone, place.nodes[r], place.nodes[c], block.template block<3, 3>(3 * r, 3 * c), *m_system);
     }
-    void add_cross(const ZoneContact& contact, const BodyPlace& a, const BodyPlace& b, const Mat6& block) {
+    template <class Block>
+    void add_cross(const ZoneContact& contact, const BodyPlace& a, const BodyPlace& b, const Block& block) {
         if (a.body < b.body)
             m_system->off_diagonal(contact.pair) += block;
         else
@@ -121,21 +130,25 @@ private:
     template <class A, class B>
     void add_pair(const ZoneContact& contact, const ActiveContact& active, const A& a, const B& b) {
         constexpr int kA = A::kSize, kB = B::kSize;
-        const ContactDerivatives<kA + kB> d = contact_derivatives(
+        ContactDerivatives<kA + kB> d = contact_derivatives(
             active.geometry, contact.range, contact.stiffness.value, base(a), base(b), m_system != nullptr,
             m_curvature != Curvature::dropped);
         if (yields(a)) add_gradient(a, d.row.template head<kA>(), d.gradient.template head<kA>(), d.force, d.stiffness);
         if (yields(b)) add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
         if (m_system == nullptr) return;
         if (yields(a) && yields(b)) {
-            const Square<kA + kB> hessian = cut_off(d.hessian, m_cut);
-            add_block(a, hessian.template topLeftCorner<kA, kA>());
-            add_block(b, hessian.template bottomRightCorner<kB, kB>());
-            add_cross(contact, a, b, hessian.template topRightCorner<kA, kB>());
+            cut_off<kA + kB>(m_cut, d.hessian);
+            add_block(a, d.hessian.template topLeftCorner<kA, kA>());
+            add_block(b, d.hessian.template bottomRightCorner<kB, kB>());
+            add_cross(contact, a, b, d.hessian.template topRightCorner<kA, kB>());
         } else if (yields(a)) {
-            add_block(a, cut_off(Square<kA>(d.hessian.template topLeftCorner<kA, kA>()), m_cut));
+            Square<kA> hessian = d.hessian.template topLeftCorner<kA, kA>();
+            cut_off<kA>(m_cut, hessian);
+            add_block(a, hessian);
         } else if (yields(b)) {
-            add_block(b, cut_off(Square<kB>(d.hessian.template bottomRightCorner<kB, kB>()), m_cut));
+            Square<kB> hessian = d.hessian.template bottomRightCorner<kB, kB>();
+            cut_off<kB>(m_cut, hessian);
+            add_block(b, hessian);
         }
     }
 
@@ -144,11 +157,14 @@ private:
 
     void add_body_on_ground(const ZonePoint& point, const ZoneContact& contact, const ActiveContact& active) {
         const Vec3 arm = active.geometry.closest.point_a - point.poses[contact.a].t;
-        const GroundDerivatives d = ground_derivatives(
-            active.geometry.distance, arm, contact.range, contact.stiffness.value, m_curvature != Curvature::dropped);
+        GroundDerivatives d = ground_derivatives(
+            active.geometry.distance, arm, contact.range, contact.stiffness.value, m_system != nullptr,
+            m_curvature != Curvature::dropped);
         const BodyPlace place{{point.poses[contact.a].t}, contact.a};
         add_gradient(place, d.row, -d.force * d.row, d.force, d.stiffness);
-        if (m_system != nullptr) add_block(place, cut_off(d.hessian, m_cut));
+        if (m_system == nullptr) return;
+        cut_off<6>(m_cut, d.hessian);
+        add_block(place, d.hessian);
     }
 
     void add_node_on_ground(const ZoneContact& contact, const ActiveContact& active) {
@@ -462,8 +478,9 @@ void differentiate(
         if (system == nullptr) continue;
         Mat6& block = system->diagonal(i);
         if (turned && curvature != Curvature::dropped && !derivatives.torque[i].isZero(0.0)) {
-            const Mat3 extra = chart_curvature(y, derivatives.torque[i]);
-            block.topLeftCorner<3, 3>() += cut_off<3>(extra, cut);
+            Mat3 extra = chart_curvature(y, derivatives.torque[i]);
+            cut_off<3>(cut, extra);
+            block.topLeftCorner<3, 3>() += extra;
         }
         block.topLeftCorner<3, 3>() += body.inertia;
         block.diagonal().tail<3>().array() += body.mass;

@@ -245,7 +245,7 @@ TEST(ground_derivatives_agree_with_differences) {
         const auto derivatives = [&](const VectorX& x, bool with_curvature) {
             const ContactGeometry g = at(x);
             return ground_derivatives(
-                g.distance, g.closest.point_a - pose.t - x.tail<3>(), range, kStiffness, with_curvature);
+                g.distance, g.closest.point_a - pose.t - x.tail<3>(), range, kStiffness, true, with_curvature);
         };
         const auto gradient = [&](const VectorX& x) -> VectorX {
             const GroundDerivatives d = derivatives(x, true);
