@@ -47,8 +47,8 @@ ClosestPoints swapped(const ClosestPoints& points) {
 /// A vertex of `v` against a patch of `p`.
 ClosestPoints vertex_against_patch(const Surface& v, int vertex, const Surface& p, int patch) {
     const Corners corners(p, patch);
-    const Vec3 normal = p.nodes != nullptr ? polygon_normal(corners.data(), corners.count())
-                                           : Vec3(p.pose->R * p.mesh->patches[patch].normal);
+    const Vec3 normal = p.pose != nullptr ? Vec3(p.pose->R * p.mesh->patches[patch].normal)
+                                          : polygon_normal(corners.data(), corners.count());
     return closest_vertex_polygon(v.vertex(vertex), {corners.data(), corners.count(), normal});
 }
 

@@ -21,7 +21,8 @@ struct Contact {
     bool with_ground() const { return object_b == kGround; }
 };
 
-/// Where the surface of an object is: at a pose, or, for cloth, at its nodes.
+/// Where the surface of an object is: at a pose, or, for cloth, at its nodes. Of a body with both, `nodes` are the vertices
+/// that are needed, placed.
 struct Surface {
     const CollisionMesh* mesh = nullptr;
     const Pose* pose = nullptr;

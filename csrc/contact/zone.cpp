@@ -244,9 +244,53 @@ void clear(Zone& zone) {
     zone.bodies.clear();
     zone.nodes.clear();
     zone.cloths.clear();
+    zone.dynamic_count = 0;
+    clear_contacts(zone);
+}
+
+void clear_contacts(Zone& zone) {
     zone.contacts.clear();
     zone.pairs.clear();
-    zone.dynamic_count = 0;
+    zone.feature_vertices.entries.clear();
+    zone.feature_vertices.first.clear();
+    zone.feature_vertices.listed.clear();
+}
+
+namespace {
+
+/// Have the vertices of a body's feature placed with the zone.
+void list_vertices(Zone& zone, int body, const Contact& contact, bool of_a) {
+    FeatureVertices& vertices = zone.feature_vertices;
+    while (static_cast<int>(vertices.first.size()) <= body) {
+        const std::size_t first = vertices.listed.size();
+        const std::size_t count = zone.mesh(static_cast<int>(vertices.first.size())).vertices.size();
+        vertices.first.push_back(static_cast<int>(first));
+        vertices.listed.resize(first + count, 0);
+    }
+    const auto list = [&](int vertex) {
+        char& listed = vertices.listed[static_cast<std::size_t>(vertices.first[body] + vertex)];
+        if (!listed) vertices.entries.push_back({body, vertex});
+        listed = 1;
+    };
+    const CollisionMesh& mesh = zone.mesh(body);
+    const int feature = of_a ? contact.feature_a : contact.feature_b;
+    if (contact.type == ContactType::edge_edge) {
+        list(mesh.edges[feature].p0);
+        list(mesh.edges[feature].p1);
+    } else if ((contact.type == ContactType::vertex_patch) == of_a) {
+        list(feature);
+    } else {
+        for (int vertex : mesh.patches[feature].vertices) list(vertex);
+    }
+}
+
+}  // namespace
+
+void append_contact(Zone& zone, const ZoneContact& contact) {
+    zone.contacts.push_back(contact);
+    if (contact.contact.with_ground()) return;
+    if (contact.cloth_a < 0) list_vertices(zone, contact.a, contact.contact, true);
+    if (contact.cloth_b < 0) list_vertices(zone, contact.b, contact.contact, false);
 }
 
 Surface surface_a(
@@ -307,8 +351,27 @@ void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std
     for (std::size_t i = 0; i < zone.nodes.size(); ++i) nodes[i] = zone.nodes[i].start + y.nodes[i];
 }
 
+namespace {
+
+void place_vertices(const Zone& zone, ZonePoint& point) {
+    point.vertices.resize(zone.feature_vertices.listed.size());
+    for (const auto& [body, vertex] : zone.feature_vertices.entries)
+        point.vertices[zone.feature_vertices.first[body] + vertex] =
+            point.poses[body] * zone.mesh(body).vertices[vertex];
+}
+
+/// A surface whose vertices are placed. Not for bodies' contacts with the ground.
+Surface placed_surface(const Zone& zone, const ZoneContact& contact, const ZonePoint& point, bool of_a) {
+    const int cloth = of_a ? contact.cloth_a : contact.cloth_b, body = of_a ? contact.a : contact.b;
+    if (cloth >= 0) return {&zone.cloth(cloth).surface, nullptr, point.nodes.data() + zone.cloths[cloth].first_node};
+    return {&zone.mesh(body), &point.poses[body], point.vertices.data() + zone.feature_vertices.first[body]};
+}
+
+}  // namespace
+
 void evaluate(const Zone& zone, ZonePoint& point) {
     place(zone, point.y, point.poses, point.nodes);
+    place_vertices(zone, point);
     double inertial = 0.0;
     for (int i = 0; i < zone.dynamic_count; ++i) {
         const ZoneBody& body = zone.bodies[i];
@@ -335,16 +398,18 @@ void evaluate(const Zone& zone, ZonePoint& point) {
     point.contact_energy = 0.0;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
-        const Surface a = surface_a(zone, contact, point.poses, point.nodes);
-        if (contact.contact.with_ground() && a.nodes == nullptr) {
-            const Pose& pose = *a.pose;
-            const double height =
-                pose.R.row(2).dot(a.mesh->vertices[contact.contact.feature_a]) + pose.t.z() - zone.ground_height;
+        const bool body_on_ground = contact.contact.with_ground() && contact.cloth_a < 0;
+        if (body_on_ground) {
+            const Pose& pose = point.poses[contact.a];
+            const double height = pose.R.row(2).dot(zone.mesh(contact.a).vertices[contact.contact.feature_a]) +
+                                  pose.t.z() - zone.ground_height;
             point.distances[k] = height;
             if (!(height < contact.range.rest)) continue;
         }
-        const ContactGeometry geometry = contact_geometry(
-            contact.contact, a, surface_b(zone, contact, point.poses, point.nodes), zone.ground_height);
+        const Surface a = body_on_ground ? surface_a(zone, contact, point.poses, point.nodes)
+                                         : placed_surface(zone, contact, point, true);
+        const Surface b = contact.contact.with_ground() ? Surface{} : placed_surface(zone, contact, point, false);
+        const ContactGeometry geometry = contact_geometry(contact.contact, a, b, zone.ground_height);
         point.distances[k] = geometry.distance;
         // Exactly parallel edges carry no energy and have no closest points: vertex-patch pairs act there.
         if (!(geometry.distance < contact.range.rest) || geometry.sine_sq == 0.0) continue;

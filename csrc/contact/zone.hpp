@@ -78,6 +78,16 @@ struct ZoneContact {
     double shift = 0.0;  ///< of range.rest, so that a hard contact's force acts at its rest distance [m]
 };
 
+/// The vertices of bodies in features of their contacts with other objects. Most are in several: each is placed once.
+struct FeatureVertices {
+    struct Entry {
+        int body, vertex;
+    };
+    std::vector<Entry> entries;
+    std::vector<int> first;    ///< per body: its vertex v stands at first[body] + v of ZonePoint::vertices
+    std::vector<char> listed;  ///< whether it stands there; only vertices in entries do
+};
+
 /// Bodies (the dynamic ones first) and the contacts that can become active.
 struct Zone {
     const Model* model = nullptr;
@@ -94,7 +104,8 @@ struct Zone {
     bool elastic = true;        ///< false: cloth is loose nodes, as in the contact pass of split coupling
     bool contacts_off = false;  ///< as in its elastic pass
     std::vector<ZoneContact> contacts;
-    IndexPairs pairs;  ///< of dynamic bodies with contacts
+    FeatureVertices feature_vertices;  ///< of the contacts
+    IndexPairs pairs;                  ///< of dynamic bodies with contacts
 
     const CollisionMesh& mesh(int body) const { return model->bodies[bodies[body].id].mesh; }
     int body_count() const { return static_cast<int>(bodies.size()); }
@@ -105,6 +116,12 @@ struct Zone {
 
 /// Remove everything that a zone consists of.
 void clear(Zone& zone);
+
+/// Remove its contacts.
+void clear_contacts(Zone& zone);
+
+/// Append a contact, and the vertices of its bodies that it needs.
+void append_contact(Zone& zone, const ZoneContact& contact);
 
 /// Compliance 0 asks for hard contacts.
 inline void set_compliance(Zone& zone, double compliance) {
@@ -129,6 +146,7 @@ struct ZonePoint {
     Coordinates y;
     std::vector<Pose> poses;
     std::vector<Vec3> nodes;        ///< positions, zone frame
+    std::vector<Vec3> vertices;     ///< of bodies, zone frame; those of Zone::feature_vertices
     std::vector<double> distances;  ///< one per contact
     std::vector<ActiveContact> active;
     double energy = 0.0;          ///< infinite at or below a pole

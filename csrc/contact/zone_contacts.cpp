@@ -127,7 +127,7 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
                           : b.body == kGround ? kInfinity
                                               : zone.bodies[b.body].mass;
     entry.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
-    zone.contacts.push_back(entry);
+    append_contact(zone, entry);
 }
 
 namespace {
@@ -149,8 +149,7 @@ public:
           m_vertices(coverage.scratch.vertices),
 
     void run() {
-        m_zone.contacts.clear();
-        m_zone.pairs.clear();
+        clear_contacts(m_zone);
         m_coverage.slack.clear();
         m_coverage.cloth_slack.clear();
         m_meshes.clear();

@@ -41,7 +41,7 @@ void add_contact(Zone& zone, int a, int b, ContactType type, int feature_a, int 
         if (zone.pairs[k] == std::pair(std::min(a, b), std::max(a, b))) contact.pair = k;
     contact.range = contact_range(kThickness, kThickness);
     contact.stiffness = {10.0, 0.0, 0.0};
-    zone.contacts.push_back(contact);
+    append_contact(zone, contact);
 }
 
 /// Every pair of features of bodies of which one yields. The order of a and b alternates.
