@@ -17,6 +17,7 @@ namespace {
 constexpr int kMaxBlocked = 2;     // shortenings of a blocked drive before it is stopped
 constexpr int kWorthSharing = 64;  // bodies and nodes to be solved for: fewer are done before a thread has woken up
 constexpr int kPortionsPerThread = 32;  // of the groups: they take differently long
+constexpr int kTreeLevels = 2;          // above the parts of the tree over bodies that threads share
 
 using Clock = std::chrono::steady_clock;
 
@@ -272,7 +273,16 @@ private:
             for (int i : m.movers) m.groups.unite(m.movers[0], i);
             return;
         }
-        for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes))) m.groups.unite(m.movers[a], m.movers[b]);
+        for (const auto& [a, b] : overlapping_pairs(tree_of_movers())) m.groups.unite(m.movers[a], m.movers[b]);
+    }
+
+    /// A tree over m.boxes, which the threads share where there are many.
+    BoxTree tree_of_movers() {
+        BoxTreeBuilder builder(m.boxes, m.boxes.size() < kBodiesARange ? 0 : kTreeLevels);
+        m_workspace.workers.for_each_range(builder.part_count(), 1, [&](int begin, int end, int) {
+            for (int part = begin; part < end; ++part) builder.build_part(part);
+        });
+        return builder.finish();
     }
 
     /// Space for a body from where it is to where it went or would go.
@@ -446,7 +456,7 @@ private:
             m.boxes.push_back(m.swept[i]);
         }
         bool merged = false;
-        for (const auto& [a, b] : overlapping_pairs(build_box_tree(m.boxes))) {
+        for (const auto& [a, b] : overlapping_pairs(tree_of_movers())) {
             const int i = m.groups.find(m.movers[a]), j = m.groups.find(m.movers[b]);
             if (i == j) continue;
             m.groups.unite(i, j);

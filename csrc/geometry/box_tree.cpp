@@ -6,45 +6,6 @@
 namespace diffsim {
 namespace {
 
-struct Builder {
-    const std::vector<Box>& boxes;
-    std::vector<Vec3> centers;
-    std::vector<int> order;
-    BoxTree tree;
-
-    explicit Builder(const std::vector<Box>& item_boxes) : boxes(item_boxes), order(item_boxes.size()) {
-        centers.reserve(boxes.size());
-        for (const Box& box : boxes) centers.push_back(box.center());
-        std::iota(order.begin(), order.end(), 0);
-        tree.nodes.reserve(2 * boxes.size());
-    }
-
-    int build(int begin, int end) {
-        const int node = static_cast<int>(tree.nodes.size());
-        tree.nodes.emplace_back();
-        if (end - begin == 1) {
-            tree.nodes[node].item = order[begin];
-            tree.nodes[node].box = boxes[order[begin]];
-            return node;
-        }
-        Box spread;
-        for (int k = begin; k < end; ++k) spread.include(centers[order[k]]);
-        int axis;
-        (spread.upper - spread.lower).maxCoeff(&axis);
-        const int middle = (begin + end) / 2;
-        std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end, [&](int a, int b) {
-            return centers[a][axis] != centers[b][axis] ? centers[a][axis] < centers[b][axis] : a < b;
-        });
-        const int left = build(begin, middle);
-        const int right = build(middle, end);
-        tree.nodes[node].left = left;
-        tree.nodes[node].right = right;
-        tree.nodes[node].box = tree.nodes[left].box;
-        tree.nodes[node].box.include(tree.nodes[right].box);
-        return node;
-    }
-};
-
 void collect_overlaps(const BoxTree& tree, int a, int b, std::vector<std::pair<int, int>>& pairs) {
     const BoxTree::Node& na = tree.nodes[a];
     const BoxTree::Node& nb = tree.nodes[b];
@@ -70,11 +31,73 @@ void collect_overlaps(const BoxTree& tree, int a, int b, std::vector<std::pair<i
 
 }  // namespace
 
+BoxTreeBuilder::BoxTreeBuilder(const std::vector<Box>& boxes, int levels) : m_boxes(boxes), m_order(boxes.size()) {
+    if (boxes.empty()) return;
+    m_centers.reserve(boxes.size());
+    for (const Box& box : boxes) m_centers.push_back(box.center());
+    std::iota(m_order.begin(), m_order.end(), 0);
+    m_tree.nodes.resize(2 * boxes.size() - 1);
+    m_parts.push_back({0, 0, static_cast<int>(boxes.size())});
+    for (int level = 0; level < levels; ++level) {
+        std::vector<Part> parts;
+        for (const Part& part : m_parts) {
+            if (part.end - part.begin == 1) {
+                parts.push_back(part);
+                continue;
+            }
+            split(part);
+            m_top.push_back(part);
+            parts.push_back(part.left());
+            parts.push_back(part.right());
+        }
+        m_parts = std::move(parts);
+    }
+}
+
+void BoxTreeBuilder::build_part(int part) { build(m_parts[static_cast<std::size_t>(part)]); }
+
+BoxTree BoxTreeBuilder::finish() {
+    for (std::size_t k = m_top.size(); k-- > 0;) join(m_top[k]);
+    return std::move(m_tree);
+}
+
+/// Sort the items into those of the left child and those of the right.
+void BoxTreeBuilder::split(const Part& part) {
+    const auto order = m_order.begin();
+    Box spread;
+    for (int k = part.begin; k < part.end; ++k) spread.include(m_centers[m_order[k]]);
+    int axis;
+    (spread.upper - spread.lower).maxCoeff(&axis);
+    std::nth_element(order + part.begin, order + part.middle(), order + part.end, [&](int a, int b) {
+        return m_centers[a][axis] != m_centers[b][axis] ? m_centers[a][axis] < m_centers[b][axis] : a < b;
+    });
+}
+
+void BoxTreeBuilder::build(const Part& part) {
+    if (part.end - part.begin == 1) {
+        BoxTree::Node& leaf = m_tree.nodes[part.node];
+        leaf.item = m_order[part.begin];
+        leaf.box = m_boxes[leaf.item];
+        return;
+    }
+    split(part);
+    build(part.left());
+    build(part.right());
+    join(part);
+}
+
+void BoxTreeBuilder::join(const Part& part) {
+    BoxTree::Node& node = m_tree.nodes[part.node];
+    node.left = part.left().node;
+    node.right = part.right().node;
+    node.box = m_tree.nodes[node.left].box;
+    node.box.include(m_tree.nodes[node.right].box);
+}
+
 BoxTree build_box_tree(const std::vector<Box>& boxes) {
-    if (boxes.empty()) return {};
-    Builder builder(boxes);
-    builder.build(0, static_cast<int>(boxes.size()));
-    return std::move(builder.tree);
+    BoxTreeBuilder builder(boxes, 0);
+    for (int part = 0; part < builder.part_count(); ++part) builder.build_part(part);
+    return builder.finish();
 }
 
 std::vector<std::pair<int, int>> overlapping_pairs(const BoxTree& tree) {
