@@ -8,6 +8,7 @@
 namespace diffsim {
 namespace {
 
+constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
 
 /// Bound on how far any vertex moves when the coordinates change by this much.
@@ -145,8 +146,8 @@ public:
           m_meshes(coverage.scratch.meshes),
           m_boxes(coverage.scratch.boxes),
           m_feature_boxes(coverage.scratch.feature_boxes),
-          m_features(coverage.scratch.features) {}
           m_vertices(coverage.scratch.vertices),
+          m_features(coverage.scratch.features) {}
 
     void run() {
         clear_contacts(m_zone);
@@ -197,7 +198,7 @@ private:
         const Vec6 change = m_end.bodies[i] - m_begin.bodies[i];
         const double radius = m_zone.mesh(i).radius;
         const bool yields = i < m_zone.dynamic_count;
-        const double slack = yields ? 0.5 * m_zone.model->thickness + 0.25 * motion_bound(change, radius) : 0.0;
+        const double slack = yields ? 0.5 * m_zone.model->thickness + kSidestep * motion_bound(change, radius) : 0.0;
         if (yields) m_coverage.slack.push_back(slack);
         m_meshes.push_back(swept_mesh(m_zone, i, m_begin, m_end, slack + sagitta(change, radius)));
         m_boxes.push_back(swept_box(m_meshes.back()));
