@@ -127,6 +127,16 @@ Pairs sheet_pairs(int n) {
     return pairs;
 }
 
+/// n x n x n blocks; each is paired with the next in each direction.
+Pairs heap_pairs(int n) {
+    Pairs pairs;
+    const auto apart = [n](int a, int b, int stride) { return std::abs(a / stride % n - b / stride % n); };
+    for (int a = 0; a < n * n * n; ++a)
+        for (int b = a + 1; b < n * n * n; ++b)
+            if (apart(a, b, 1) + apart(a, b, n) + apart(a, b, n * n) == 1) pairs.emplace_back(a, b);
+    return pairs;
+}
+
 Pairs chain_pairs(int count) {
     Pairs pairs;
     for (int i = 0; i + 1 < count; ++i) pairs.emplace_back(i, i + 1);
@@ -210,6 +220,15 @@ TEST(sparse_block_cholesky_of_common_graphs) {
     Pairs pieces = chain_pairs(20);
     for (const auto& [i, j] : sheet_pairs(6)) pieces.emplace_back(21 + i, 21 + j);
     check_graph(random_sizes(random, 57, {3, 6}), pieces);
+}
+
+TEST(sparse_block_cholesky_of_graphs_large_enough_to_be_dissected) {
+    check::Random random(8);
+    SparseBlockCholesky cholesky;
+    const int n = 6;
+    const System system = make_system(std::vector<int>(static_cast<std::size_t>(n * n * n), 6), heap_pairs(n), random);
+    cholesky.analyze(system.sizes, system.pairs);
+    check_solution(cholesky, system, random);
 }
 
 TEST(sparse_block_cholesky_of_nothing_and_of_one_block) {
