@@ -117,7 +117,7 @@ def print_slopes(curves: Mapping[str, tuple[list[float], list[float]]]) -> None:
     print("# log-log slopes:", ", ".join(f"{name} {slope(x, y):.3f}" for name, (x, y) in curves.items()))
 
 
-def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9.6, 3.8)) -> None:
+def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9.6, 4.6)) -> None:
     """Make a figure, let `draw(figure)` fill it, write it."""
     import matplotlib
 
@@ -135,14 +135,21 @@ def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float]
 def draw_curves(
     axes: Any, curves: Mapping[str, tuple[Sequence[float], Sequence[float | None]]], xlabel: str, ylabel: str
 ) -> None:
-    """Log-log; None is a point left out. Names with brackets are drawn broken: figures not measured in this run."""
+    """Log-log; None is a point left out. Names with brackets are drawn broken: figures not measured in this run. A name
+    has the same colour in all panels of a figure.
+    """
+    named: dict[str, str] = {}
+    for other in axes.figure.axes:
+        named |= {line.get_label(): line.get_color() for line in other.get_lines()}
     for name, (x, y) in curves.items():
         points = [(a, b) for a, b in zip(x, y) if b is not None]
         if points:
-            axes.plot(*zip(*points), marker="o", ms=4.0, lw=1.4, ls=(0, (4, 3)) if "(" in name else "-", label=name)
+            color = named.setdefault(name, f"C{len(named)}")
+            style = (0, (4, 3)) if "(" in name else "-"
+            axes.plot(*zip(*points), marker="o", ms=4.0, lw=1.4, ls=style, color=color, label=name)
     axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
     axes.grid(True, which="major", alpha=0.3)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.01), borderaxespad=0.0, frameon=False)
 
 
 # ---- time and memory -------------------------------------------------------------------------------------------------
