@@ -311,7 +311,7 @@ def draw(rows: list[dict[str, Any]], figure: Any) -> None:
 def main() -> int:
     parser = make_parser(__doc__, rounds=3, plot=True)
     parser.add_argument("--nodes", type=int, nargs="+", default=NODES, help="along a side")
-    parser.add_argument("--steps", type=int, default=40, help="of which the first nine or ten are flight")
+    parser.add_argument("--steps", type=int, default=20, help="of which the first nine or ten are flight")
     parser.add_argument("--no-peers", action="store_true", help="time diffsim alone")
     options = parser.parse_args()
     if options.quick:
