@@ -36,17 +36,12 @@ void RecordedZones::rebuild(int index, ZoneMemory& memory, std::vector<int>& loc
 void RecordedZones::add_objects(
     const Range& first, const Range& end, ZoneMemory& memory, std::vector<int>& local) const {
     Zone& zone = memory.zone;
-    clear(zone);
-    zone.model = &m_model;
-    set_compliance(zone, m_options.compliance);
-    zone.dt = m_options.dt;
-    zone.cloth_parameters = &m_parameters.cloths;
+    const Vec3 origin =
+        first.body < end.body
+            ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
+            : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
+    start_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
     zone.elastic = !m_options.split;
-    zone.contacts_off = false;
-    zone.origin = first.body < end.body
-                      ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
-                      : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
-    zone.ground_height = m_model.ground.height - zone.origin.z();
     memory.workspace.point.y.resize(0, 0);
     for (int b = first.body; b < end.body; ++b) join_body(memory, local, m_record.zones.bodies[b]);
     zone.dynamic_count = end.body - first.body;

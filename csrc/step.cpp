@@ -208,17 +208,8 @@ private:
 
     /// The memory's zone, empty.
     Zone& new_zone(ZoneMemory& memory, const Vec3& origin) const {
-        Zone& zone = memory.zone;
-        clear(zone);
-        zone.model = &m_model;
-        set_compliance(zone, m_options.compliance);
-        zone.dt = m_options.dt;
-        zone.cloth_parameters = &m_parameters.cloths;
-        zone.origin = origin;
-        zone.ground_height = m_model.ground.height - origin.z();
-        zone.elastic = true;
-        zone.contacts_off = false;
-        return zone;
+        start_zone(memory.zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
+        return memory.zone;
     }
 
     void note(const ZoneResult& result) {

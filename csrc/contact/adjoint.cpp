@@ -205,10 +205,7 @@ MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordin
     MatrixX matrix = MatrixX::Zero(size, size);
     if (size == 0) return matrix;
     BlockSystem cloth;
-    BlockPattern pattern = base_pattern(zone);
-    pattern.body_count = 0;
-    pattern.body_pairs.clear();
-    cloth.set_pattern(std::move(pattern));
+    cloth.set_pattern(cloth_pattern(zone));
     cloth.set_zero();
     if (zone.elastic) add_elastic_hessian(zone, point, cut, cloth);
     for (int i = 0; i < zone.node_count(); ++i) {

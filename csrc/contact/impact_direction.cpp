@@ -60,10 +60,7 @@ int solve_with_limited_turns(const Zone& zone, std::vector<double>& mass_factor,
 /// The nodes' part of the quadratic model at a point: mass and elasticity, and their gradient with the pinned nodes at
 /// their targets.
 void cloth_model(const Zone& zone, const ZonePoint& point, BlockSystem& cloth, Coordinates& gradient) {
-    BlockPattern pattern = base_pattern(zone);
-    pattern.body_count = 0;
-    pattern.body_pairs.clear();
-    cloth.set_pattern(std::move(pattern));
+    cloth.set_pattern(cloth_pattern(zone));
     cloth.set_zero();
     if (zone.elastic) add_elastic_hessian(zone, point, kAllCut, cloth);
     std::vector<Vec3> driven(zone.nodes.size(), Vec3::Zero());

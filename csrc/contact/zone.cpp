@@ -240,12 +240,22 @@ Pose pose_at(const ZoneBody& body, const Vec6& y) {
     return {exp_rotation(y.head<3>()) * body.start.R, body.start.t + y.tail<3>()};
 }
 
-void clear(Zone& zone) {
+void start_zone(
+    Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
+    const Vec3& origin) {
     zone.bodies.clear();
     zone.nodes.clear();
     zone.cloths.clear();
     zone.dynamic_count = 0;
     clear_contacts(zone);
+    zone.model = &model;
+    zone.cloth_parameters = &cloths;
+    set_compliance(zone, compliance);
+    zone.dt = dt;
+    zone.origin = origin;
+    zone.ground_height = model.ground.height - origin.z();
+    zone.elastic = true;
+    zone.contacts_off = false;
 }
 
 void clear_contacts(Zone& zone) {
@@ -419,17 +429,22 @@ void evaluate(const Zone& zone, ZonePoint& point) {
     point.energy = inertial + point.elastic_energy + point.contact_energy;
 }
 
-BlockPattern base_pattern(const Zone& zone) {
+BlockPattern cloth_pattern(const Zone& zone) {
     BlockPattern pattern;
-    pattern.body_count = zone.dynamic_count;
     pattern.node_count = zone.node_count();
-    pattern.body_pairs = zone.pairs;
     if (!zone.elastic) return pattern;
     for (std::size_t c = 0; c < zone.cloths.size(); ++c) {
         const int first = zone.cloths[c].first_node;
         for (const auto& [i, j] : zone.cloth(static_cast<int>(c)).node_pairs)
             pattern.node_pairs.emplace_back(first + i, first + j);
     }
+    return pattern;
+}
+
+BlockPattern base_pattern(const Zone& zone) {
+    BlockPattern pattern = cloth_pattern(zone);
+    pattern.body_count = zone.dynamic_count;
+    pattern.body_pairs = zone.pairs;
     return pattern;
 }
 

@@ -114,9 +114,6 @@ struct Zone {
     bool yields(int body) const { return body >= 0 && body < dynamic_count; }
 };
 
-/// Remove everything that a zone consists of.
-void clear(Zone& zone);
-
 /// Remove its contacts.
 void clear_contacts(Zone& zone);
 
@@ -128,6 +125,11 @@ inline void set_compliance(Zone& zone, double compliance) {
     zone.hard = compliance == 0.0;
     zone.compliance = zone.hard ? kDefaultCompliance : compliance;
 }
+
+/// Empty a zone, for bodies and cloths of a model to join it.
+void start_zone(
+    Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
+    const Vec3& origin);
 
 /// Pose of a body at its coordinates.
 Pose pose_at(const ZoneBody& body, const Vec6& y);
@@ -181,6 +183,9 @@ struct ZoneDerivatives {
     double largest_force;      ///< of a contact on a body, of all but inertia on a node, in units of |L⁻¹ g|, M = L Lᵀ
     double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|; of a node with the cloth's own
 };
+
+/// The pattern of the elastic Hessian, nodes alone.
+BlockPattern cloth_pattern(const Zone& zone);
 
 /// The pattern of a zone's Hessian without the contacts of cloth.
 BlockPattern base_pattern(const Zone& zone);
