@@ -6,6 +6,9 @@ namespace diffsim {
 /// (r / 4) 4w + 4c + r % 4, so that a product L Lᵀ reads both of its factors from front to back.
 inline constexpr int kCholeskyTile = 4;
 
+/// The next number of rows or columns that makes whole tiles.
+constexpr int padded_to_tiles(int count) { return (count + kCholeskyTile - 1) / kCholeskyTile * kCholeskyTile; }
+
 /// One step of a multifrontal Cholesky factorization: a dense matrix  [A  Bᵀ; B  C]  of which A is eliminated.
 struct CholeskyFront {
     int width, below;  ///< rows of A and of B, multiples of kCholeskyTile

@@ -1,283 +1,17 @@
 #include "math/sparse_block_cholesky.hpp"
 
-#include <Eigen/OrderingMethods>
-#include <Eigen/SparseCore>
 #include <algorithm>
 #include <cassert>
 #include <cstddef>
 #include <utility>
 
 #include "math/cholesky_front.hpp"
-#include "math/nested_dissection.hpp"
+#include "math/supernodes.hpp"
 
 namespace diffsim {
 namespace {
 
 constexpr int kTile = kCholeskyTile;
-
-constexpr int padded(int count) { return (count + kTile - 1) / kTile * kTile; }
-
-/// Neighbours of each block, both ways. `pair` is the number of the pair they come from.
-struct Graph {
-    std::vector<int> start, neighbor, pair;
-};
-
-Graph make_graph(int count, const std::vector<std::pair<int, int>>& pairs) {
-    Graph graph;
-    graph.start.assign(static_cast<std::size_t>(count) + 1, 0);
-    for (const auto& [i, j] : pairs) {
-        assert(0 <= i && i < j && j < count);
-        ++graph.start[i + 1];
-        ++graph.start[j + 1];
-    }
-    for (int i = 0; i < count; ++i) graph.start[i + 1] += graph.start[i];
-    graph.neighbor.resize(2 * pairs.size());
-    graph.pair.resize(2 * pairs.size());
-    std::vector<int> next(graph.start.begin(), graph.start.end() - 1);
-    for (int k = 0; k < static_cast<int>(pairs.size()); ++k) {
-        const auto [i, j] = pairs[k];
-        graph.neighbor[next[i]] = j;
-        graph.pair[next[i]++] = k;
-        graph.neighbor[next[j]] = i;
-        graph.pair[next[j]++] = k;
-    }
-    return graph;
-}
-
-/// The block that comes at each place of an order with little fill: approximate minimum degree  [amestoy1996amd].
-std::vector<int> minimum_degree_order(const Graph& graph) {
-    const int count = static_cast<int>(graph.start.size()) - 1;
-    Eigen::SparseMatrix<char> pattern(count, count);  // Eigen's ordering wants the diagonal too
-    pattern.resizeNonZeros(static_cast<Eigen::Index>(graph.neighbor.size()) + count);
-    int* const outer = pattern.outerIndexPtr();
-    int* const inner = pattern.innerIndexPtr();
-    int next = 0;
-    for (int i = 0; i < count; ++i) {
-        outer[i] = next;
-        inner[next++] = i;
-        for (int k = graph.start[i]; k < graph.start[i + 1]; ++k) inner[next++] = graph.neighbor[k];
-    }
-    outer[count] = next;
-    Eigen::PermutationMatrix<Eigen::Dynamic, Eigen::Dynamic, int> order;
-    Eigen::internal::minimum_degree_ordering(pattern, order);
-    return std::vector<int>(order.indices().data(), order.indices().data() + count);
-}
-
-std::vector<int> inverse_of(const std::vector<int>& order) {
-    std::vector<int> position(order.size());
-    for (std::size_t k = 0; k < order.size(); ++k) position[order[k]] = static_cast<int>(k);
-    return position;
-}
-
-/// A column of the elimination tree.
-struct Column {
-    int parent = -1;   ///< -1: none
-    int below = 0;     ///< scalar rows of the factor below the column's block
-    int visitor = -1;  ///< the last row that passed
-};
-
-std::vector<Column> make_tree(const Graph& graph, const std::vector<int>& order, const std::vector<int>& sizes) {
-    const std::vector<int> position = inverse_of(order);
-    std::vector<Column> columns(order.size());
-    for (int i = 0; i < static_cast<int>(order.size()); ++i) {
-        const int block = order[i];
-        columns[i].visitor = i;
-        for (int k = graph.start[block]; k < graph.start[block + 1]; ++k) {
-            // Row i of the factor is non-zero in the columns on the way from the neighbour up to i.
-            const int neighbor = position[graph.neighbor[k]];
-            if (neighbor > i) continue;
-            for (Column* column = &columns[neighbor]; column->visitor != i; column = &columns[column->parent]) {
-                if (column->parent < 0) column->parent = i;
-                column->below += sizes[block];
-                column->visitor = i;
-            }
-        }
-    }
-    return columns;
-}
-
-/// Lists of items per owner, ascending.
-struct Lists {
-    std::vector<int> head, next;
-    explicit Lists(std::size_t count) : head(count, -1), next(count, -1) {}
-    void push_front(int owner, int item) {
-        next[item] = head[owner];
-        head[owner] = item;
-    }
-};
-
-constexpr int kNotANode = -2;
-
-/// Children before parents, each subtree in one piece. Items whose parent is kNotANode are left out.
-std::vector<int> postorder(const std::vector<int>& parent) {
-    const int count = static_cast<int>(parent.size());
-    Lists children(parent.size() + 1);  // the last list holds the roots
-    for (int i = count - 1; i >= 0; --i)
-        if (parent[i] != kNotANode) children.push_front(parent[i] < 0 ? count : parent[i], i);
-    std::vector<int> result, stack;
-    result.reserve(parent.size());
-    for (int root = children.head[count]; root >= 0; root = children.next[root]) {
-        stack.push_back(root);
-        while (!stack.empty()) {
-            const int node = stack.back();
-            const int child = children.head[node];
-            if (child >= 0) {
-                children.head[node] = children.next[child];
-                stack.push_back(child);
-            } else {
-                result.push_back(node);
-                stack.pop_back();
-            }
-        }
-    }
-    return result;
-}
-
-/// Time to eliminate a front, in about processor cycles, measured. The result is not sensitive to them: without those per
-/// front and tile, or with three times as much, factorizations took at most a tenth longer.
-double elimination_cost(int width, int below) {
-    constexpr double kPerFront = 300.0, kPerTile = 25.0, kPerTileColumn = 8.0, kPerUpdateTile = 25.0;
-    const double w = padded(width) / kTile, b = padded(below) / kTile;
-    const double panel_tiles = w * (w + 1.0) / 2.0 + w * b, update_tiles = b * (b + 1.0) / 2.0;
-    const double panel_columns = kTile * (w * (w - 1.0) * (w + 1.0) / 6.0 + b * w * (w - 1.0) / 2.0);
-    const double update_columns = kTile * w * update_tiles;
-    return kPerFront + kPerTile * (panel_tiles + update_tiles) + kPerTileColumn * (panel_columns + update_columns) +
-           kPerUpdateTile * update_tiles;
-}
-
-/// Groups of columns with parents among the groups, in postorder.
-struct Partition {
-    std::vector<int> order;   ///< blocks, group by group
-    std::vector<int> end;     ///< where each group ends in `order`
-    std::vector<int> parent;  ///< of the groups; -1: none
-    std::vector<int> width, below;
-};
-
-/// Columns of the same pattern, then merged with their parents as long as that saves time.
-Partition make_partition(
-    const std::vector<Column>& tree, const std::vector<int>& order, const std::vector<int>& sizes) {
-    const int count = static_cast<int>(order.size());
-    std::vector<int> column_parent(order.size());
-    for (int i = 0; i < count; ++i) column_parent[i] = tree[i].parent;
-    const std::vector<int> columns = postorder(column_parent);
-    std::vector<int> group_of(order.size()), first, last, width, below;
-    for (int k = 0; k < count; ++k) {
-        const int column = columns[k], size = sizes[order[column]];
-        const bool joins =
-            k > 0 && tree[columns[k - 1]].parent == column && tree[columns[k - 1]].below == tree[column].below + size;
-        if (!joins) {
-            first.push_back(k);
-            last.push_back(k);
-            width.push_back(0);
-            below.push_back(0);
-        }
-        last.back() = k;
-        width.back() += size;
-        below.back() = tree[column].below;
-        group_of[column] = static_cast<int>(first.size()) - 1;
-    }
-
-    const int group_count = static_cast<int>(first.size());
-    std::vector<int> parent(first.size(), -1), merged_into(first.size(), -1);
-    Lists children(first.size());
-    for (int g = group_count - 1; g >= 0; --g) {
-        const int above = column_parent[columns[last[g]]];
-        if (above < 0) continue;
-        parent[g] = group_of[above];
-        children.push_front(parent[g], g);
-    }
-    std::vector<double> cost(first.size());
-    for (int g = 0; g < group_count; ++g) {
-        cost[g] = elimination_cost(width[g], below[g]);
-        for (int child = children.head[g]; child >= 0; child = children.next[child]) {
-            const double together = elimination_cost(width[g] + width[child], below[g]);
-            if (together > cost[g] + cost[child]) continue;
-            cost[g] = together;
-            width[g] += width[child];
-            merged_into[child] = g;
-        }
-    }
-
-    // Parents come later than their children, so that going down finds them merged already.
-    Lists members(first.size());
-    std::vector<int> keeper(first.size()), kept_parent(first.size(), kNotANode);
-    for (int g = group_count - 1; g >= 0; --g) {
-        keeper[g] = merged_into[g] < 0 ? g : keeper[merged_into[g]];
-        members.push_front(keeper[g], g);
-        if (keeper[g] == g) kept_parent[g] = parent[g] < 0 ? -1 : keeper[parent[g]];
-    }
-    const std::vector<int> kept = postorder(kept_parent);
-    std::vector<int> place(first.size());
-    for (std::size_t k = 0; k < kept.size(); ++k) place[kept[k]] = static_cast<int>(k);
-
-    Partition partition;
-    partition.order.reserve(order.size());
-    for (const int g : kept) {
-        for (int member = members.head[g]; member >= 0; member = members.next[member])
-            for (int k = first[member]; k <= last[member]; ++k) partition.order.push_back(order[columns[k]]);
-        partition.end.push_back(static_cast<int>(partition.order.size()));
-        partition.parent.push_back(kept_parent[g] < 0 ? -1 : place[kept_parent[g]]);
-        partition.width.push_back(width[g]);
-        partition.below.push_back(below[g]);
-    }
-    return partition;
-}
-
-double elimination_cost(const Partition& partition) {
-    double cost = 0.0;
-    for (std::size_t g = 0; g < partition.end.size(); ++g)
-        cost += elimination_cost(partition.width[g], partition.below[g]);
-    return cost;
-}
-
-/// By minimum degree, or by nested dissection where that is faster, which it mostly is from some thousand blocks on.
-Partition find_partition(const Graph& graph, const std::vector<int>& sizes) {
-    // Not tried where it would take more than about a third of a factorization, which tends to be where it gains
-    // nothing: on small, thin and loosely coupled graphs.
-    constexpr double kPerNeighbor = 2000.0, kPerBlock = 8000.0;
-    const std::vector<int> order = minimum_degree_order(graph);
-    Partition partition = make_partition(make_tree(graph, order, sizes), order, sizes);
-    const double cost = elimination_cost(partition);
-    if (cost <
-        kPerNeighbor * static_cast<double>(graph.neighbor.size()) + kPerBlock * static_cast<double>(sizes.size()))
-        return partition;
-    const std::vector<int> dissected = nested_dissection({graph.start, graph.neighbor}, sizes, order).order;
-    Partition other = make_partition(make_tree(graph, dissected, sizes), dissected, sizes);
-    if (elimination_cost(other) < cost) partition = std::move(other);
-    return partition;
-}
-
-/// For each group the places in the order of the blocks below it, ascending.
-struct RowLists {
-    std::vector<int> start, row;
-};
-
-RowLists make_row_lists(const Graph& graph, const Partition& partition, const std::vector<int>& group_of) {
-    const int count = static_cast<int>(partition.order.size()), group_count = static_cast<int>(partition.end.size());
-    const std::vector<int> position = inverse_of(partition.order);
-    std::vector<int> visitor(partition.end.size(), -1);
-    std::vector<std::pair<int, int>> found;  // group, row
-    RowLists lists;
-    lists.start.assign(partition.end.size() + 1, 0);
-    for (int i = 0; i < count; ++i) {
-        const int block = partition.order[i];
-        visitor[group_of[i]] = i;
-        for (int k = graph.start[block]; k < graph.start[block + 1]; ++k) {
-            const int column = position[graph.neighbor[k]];
-            if (column > i) continue;
-            for (int g = group_of[column]; visitor[g] != i; g = partition.parent[g]) {
-                visitor[g] = i;
-                found.emplace_back(g, i);
-                ++lists.start[g + 1];
-            }
-        }
-    }
-    for (int g = 0; g < group_count; ++g) lists.start[g + 1] += lists.start[g];
-    std::vector<int> next(lists.start.begin(), lists.start.end() - 1);
-    lists.row.resize(found.size());
-    for (const auto& [g, row] : found) lists.row[next[g]++] = row;
-    return lists;
-}
 
 template <int kRows, int kColumns>
 void copy_block(const double* from, double* to, std::ptrdiff_t stride) {
@@ -303,18 +37,18 @@ void SparseBlockCholesky::Buffer::reserve(std::size_t count) {
 /// What analyze() knows of the matrix. A block's place is its position in the order of elimination.
 struct SparseBlockCholesky::Analysis {
     const std::vector<int>& sizes;  ///< of the blocks in natural order
-    Graph graph;
-    Partition partition;  ///< into supernodes
+    BlockGraph graph;
+    Supernodes supernodes;
     std::vector<int> place_of_block;
     std::vector<int> node_of_place;
     std::vector<int> start_of_place;  ///< first scalar row
-    RowLists rows;
-    Lists children;              ///< of the supernodes
+    SupernodeRows rows;
+    ItemLists children;          ///< of the supernodes
     std::vector<int> front_row;  ///< of each place, in the front being looked at
 
-    int begin(int node) const { return node == 0 ? 0 : partition.end[node - 1]; }
-    int end(int node) const { return partition.end[node]; }
-    int size_at(int place) const { return sizes[partition.order[place]]; }
+    int begin(int node) const { return node == 0 ? 0 : supernodes.end[node - 1]; }
+    int end(int node) const { return supernodes.end[node]; }
+    int size_at(int place) const { return sizes[supernodes.order[place]]; }
 };
 
 void SparseBlockCholesky::analyze(const std::vector<int>& sizes, const std::vector<std::pair<int, int>>& pairs) {
@@ -329,17 +63,17 @@ void SparseBlockCholesky::analyze(const std::vector<int>& sizes, const std::vect
     m_factor_size = 0;
     if (sizes.empty()) return;
 
-    Graph graph = make_graph(static_cast<int>(sizes.size()), pairs);
-    Partition partition = find_partition(graph, sizes);
-    const std::size_t node_count = partition.end.size();
-    Analysis analysis{sizes, std::move(graph), std::move(partition), {}, {}, {}, {}, Lists(node_count), {}};
+    BlockGraph graph = make_block_graph(static_cast<int>(sizes.size()), pairs);
+    Supernodes supernodes = find_supernodes(graph, sizes);
+    const std::size_t node_count = supernodes.end.size();
+    Analysis analysis{sizes, std::move(graph), std::move(supernodes), {}, {}, {}, {}, ItemLists(node_count), {}};
 
     m_supernodes.resize(node_count);
     number_rows(analysis);
-    analysis.rows = make_row_lists(analysis.graph, analysis.partition, analysis.node_of_place);
+    analysis.rows = rows_below(analysis.graph, analysis.supernodes, analysis.node_of_place);
     analysis.front_row.resize(sizes.size());
     for (int s = static_cast<int>(node_count) - 1; s >= 0; --s) {
-        const int parent = analysis.partition.parent[s];
+        const int parent = analysis.supernodes.parent[s];
         m_supernodes[s].parent = parent;
         if (parent >= 0) analysis.children.push_front(parent, s);
         m_supernodes[s].stack = parent < 0 ? 0 : 1 - m_supernodes[parent].stack;
@@ -358,7 +92,7 @@ void SparseBlockCholesky::number_rows(Analysis& analysis) {
     const std::size_t count = analysis.sizes.size();
     std::vector<int> natural_start(count);
     for (std::size_t i = 1; i < count; ++i) natural_start[i] = natural_start[i - 1] + analysis.sizes[i - 1];
-    analysis.place_of_block = inverse_of(analysis.partition.order);
+    analysis.place_of_block = inverse_of(analysis.supernodes.order);
     analysis.node_of_place.resize(count);
     analysis.start_of_place.resize(count);
     m_node_of_block.resize(count);
@@ -369,7 +103,7 @@ void SparseBlockCholesky::number_rows(Analysis& analysis) {
             const int size = analysis.size_at(place);
             analysis.node_of_place[place] = s;
             analysis.start_of_place[place] = m_row_count;
-            const int block = analysis.partition.order[place];
+            const int block = analysis.supernodes.order[place];
             m_node_of_block[block] = s;
             m_first_row[block] = m_row_count;
             m_permutation.push_back({natural_start[block], m_row_count, size});
@@ -391,8 +125,8 @@ void SparseBlockCholesky::append_run(std::vector<Run>& runs, int begin, const Ru
 
 void SparseBlockCholesky::map_rows(Analysis& analysis, int s) {
     Supernode& node = m_supernodes[s];
-    node.width = analysis.partition.width[s];
-    node.padded_width = padded(node.width);
+    node.width = analysis.supernodes.width[s];
+    node.padded_width = padded_to_tiles(node.width);
     for (int place = analysis.begin(s); place < analysis.end(s); ++place)
         analysis.front_row[place] = analysis.start_of_place[place] - node.first;
 
@@ -405,16 +139,16 @@ void SparseBlockCholesky::map_rows(Analysis& analysis, int s) {
         below += size;
     }
     node.solve_run_end = static_cast<int>(m_solve_runs.size());
-    assert(below == analysis.partition.below[s]);
-    node.padded_below = padded(below);
+    assert(below == analysis.supernodes.below[s]);
+    node.padded_below = padded_to_tiles(below);
 }
 
 void SparseBlockCholesky::map_entries(const Analysis& analysis, int s) {
-    const Graph& graph = analysis.graph;
+    const BlockGraph& graph = analysis.graph;
     Supernode& node = m_supernodes[s];
     node.entry_begin = static_cast<int>(m_entries.size());
     for (int place = analysis.begin(s); place < analysis.end(s); ++place) {
-        const int block = analysis.partition.order[place], size = analysis.sizes[block];
+        const int block = analysis.supernodes.order[place], size = analysis.sizes[block];
         const int column = analysis.front_row[place];
         m_entries.push_back({~block, false, column, column, size, size});
         for (int k = graph.start[block]; k < graph.start[block + 1]; ++k) {
