@@ -4,7 +4,7 @@
 #include <optional>
 #include <string>
 
-#include "step.hpp"
+#include "step/step.hpp"
 
 /// Many steps of many scenes: the arrays of the Python layer in, the same out.
 namespace diffsim {

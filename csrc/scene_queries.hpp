@@ -1,7 +1,7 @@
 #pragma once
 
 #include "model/state.hpp"
-#include "step.hpp"
+#include "step/step.hpp"
 
 /// Questions about a state that no step asks.
 namespace diffsim {

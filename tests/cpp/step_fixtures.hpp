@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "cloth_fixtures.hpp"
-#include "step.hpp"
+#include "step/step.hpp"
 
 namespace fixtures::steps {
 

@@ -21,7 +21,6 @@ ROOMS = {
     "rollout": ["scene_queries"],
     "bindings": ["rollout", "scene_queries"],
 }
-STEP_FILES = ("step", "step_backward", "recorded_zones")  # of one room
 PYTHON_ROOM = "bindings"  # the only one that sees Python
 
 INCLUDE = re.compile(r'^\s*#\s*include\s*([<"])([^>"]+)[>"]', re.MULTILINE)
@@ -33,9 +32,8 @@ def reachable_rooms(room: str) -> set[str]:
 
 
 def room_of(path: Path, csrc: Path) -> str:
-    """The first folder, or for a file directly in csrc its name, or what STEP_FILES say."""
-    name = Path(path.relative_to(csrc).parts[0]).stem
-    return "step" if name in STEP_FILES else name
+    """The first folder, or for a file directly in csrc its name."""
+    return Path(path.relative_to(csrc).parts[0]).stem
 
 
 def violations(csrc: Path) -> list[str]:
@@ -75,9 +73,9 @@ def tree(tmp_path: Path) -> Path:
         "contact/zone.hpp": '#include "collision/ccd.hpp"\n',
         "contact/zone.cpp": '#include "zone.hpp"\n',
         "step.cpp": '#include "contact/zone.hpp"\n#include "dynamics/solve.hpp"\n',
-        "step.hpp": '#include "model/model.hpp"\n',
-        "step_backward.cpp": '#include "step.hpp"\n',
-        "rollout.hpp": '#include "step.hpp"\n',
+        "step/step.hpp": '#include "model/model.hpp"\n',
+        "step_backward.cpp": '#include "step/step.hpp"\n',
+        "rollout.hpp": '#include "step/step.hpp"\n',
         "rollout.cpp": '#include "rollout.hpp"\n#include "math/rotation.hpp"\n',
         "bindings/bind_contact.cpp": '#include <pybind11/pybind11.h>\n#include "contact/zone.hpp"\n',
         "bindings/bind_rollout.cpp": '#include <pybind11/pybind11.h>\n#include "rollout.hpp"\n',
@@ -100,8 +98,8 @@ def test_allowed_includes_pass(tree: Path) -> None:
         ("contact/a.cpp", '#include "../step.hpp"', "contact may not include ../step.hpp"),
         ("dynamics/a.cpp", '#include "collision/ccd.hpp"', "dynamics may not include collision/ccd.hpp"),
         ("geometry/a.hpp", '#include "model/model.hpp"', "geometry may not include model/model.hpp"),
-        ("step.hpp", '#include "rollout.hpp"', "step may not include rollout.hpp"),
-        ("step.hpp", '#include "bindings/bind_contact.cpp"', "step may not include bindings/bind_contact.cpp"),
+        ("step/step.hpp", '#include "rollout.hpp"', "step may not include rollout.hpp"),
+        ("step/step.hpp", '#include "bindings/bind_contact.cpp"', "step may not include bindings/bind_contact.cpp"),
         ("rollout.cpp", '#include "bindings/bind_rollout.cpp"', "rollout may not include bindings/bind_rollout.cpp"),
         ("rollout.hpp", "#include <pybind11/numpy.h>", "only bindings may include pybind11/numpy.h"),
         ("math/a.hpp", '#include "missing.hpp"', "missing.hpp does not exist"),

@@ -1,10 +1,10 @@
-#include "step.hpp"
+#include "step/step.hpp"
 
 #include <Eigen/LU>
 #include <algorithm>
 
 #include "math/rotation.hpp"
-#include "recorded_zones.hpp"
+#include "step/recorded_zones.hpp"
 
 namespace diffsim {
 namespace {

@@ -1,15 +1,14 @@
-#include "step.hpp"
+#include "step/step.hpp"
 
-#include <Eigen/LU>
 #include <algorithm>
 #include <chrono>
 #include <cstdio>
-#include <numeric>
 #include <stdexcept>
 #include <string>
 #include <utility>
 
 #include "math/rotation.hpp"
+#include "step/object_groups.hpp"
 
 namespace diffsim {
 namespace {
@@ -17,7 +16,6 @@ namespace {
 constexpr int kMaxBlocked = 2;     // shortenings of a blocked drive before it is stopped
 constexpr int kWorthSharing = 64;  // bodies and nodes to be solved for: fewer are done before a thread has woken up
 constexpr int kPortionsPerThread = 32;  // of the groups: they take differently long
-constexpr int kTreeLevels = 2;          // above the parts of the tree over bodies that threads share
 
 using Clock = std::chrono::steady_clock;
 
@@ -40,17 +38,6 @@ std::string number(double value) {
     std::snprintf(text, sizeof text, "%g", value);
     return text;
 }
-
-/// Bound on how far vertices leave the straight line between the ends of a turn.
-double sagitta(const Vec6& motion, double radius) {
-    return radius * std::min(0.125 * motion.head<3>().squaredNorm(), 2.0);
-}
-
-/// Objects to be solved together: their places in ForwardScratch::members.
-struct Group {
-    int root;  ///< the smallest of them
-    int first, end;
-};
 
 /// What solving one group of bodies gave. Kept at the group's smallest body.
 struct GroupOutcome {
@@ -85,18 +72,17 @@ struct StepWorkspace::ForwardScratch {
     std::vector<ZoneBody> bodies;
     // One entry per object: the bodies, then the cloths.
     std::vector<GroupOutcome> outcomes;
-    std::vector<Box> swept, visited;  ///< world frame, margins included; visited space of objects that were in a zone
-    std::vector<char> dirty;          ///< groups to be solved, at their smallest object
-    UnionFind groups;
+    std::vector<Box> visited;  ///< world frame, margins included
+    std::vector<char> dirty;   ///< groups to be solved, at their smallest object
+    ObjectGroups groups;
 
     Coordinates y;
     std::vector<Vec3> elastic_shift;  ///< with split coupling: each node's motion without contact
     PassiveBodies passive;
-    std::vector<int> dynamic;              ///< the dynamic bodies
-    std::vector<int> movers;               ///< the objects that yield: the dynamic bodies and the cloths
-    std::vector<int> members, member_end;  ///< movers sorted by group; where each group ends, by smallest object
-    std::vector<Box> boxes;
-    std::vector<Group> to_solve;
+    std::vector<int> dynamic;  ///< the dynamic bodies
+    std::vector<int> movers;   ///< the objects that yield: the dynamic bodies and the cloths
+    std::vector<Box> passive_boxes;
+    std::vector<ObjectGroup> to_solve;
     std::vector<GroupResults> results;  ///< one per thread
     std::vector<BlockedDrive> blocked;
     std::vector<ContactList> contact_lists;  ///< of the groups, by their smallest objects
@@ -225,22 +211,18 @@ private:
 
     void list_passive() {
         m.passive.bodies.clear();
-        m.boxes.clear();
+        m.passive_boxes.clear();
         for (int i = 0; i < m_model.body_count(); ++i) {
             if (body(i).is_dynamic()) continue;
             const Pose start{quaternion_to_matrix(m_state.bodies[i].orientation), m_state.bodies[i].position};
-            ZoneBody driven;
-            driven.start = start;
-            const double reach = body(i).margin + sagitta(m.y.bodies[i], body(i).mesh.radius);
-            m.boxes.push_back(swept_box({&body(i).mesh, {start, pose_at(driven, m.y.bodies[i])}, reach}));
+            m.passive_boxes.push_back(space_of_driven_body(m_model, i, start, m.y.bodies[i]));
             m.passive.bodies.push_back({i, start, m.y.bodies[i]});
         }
-        m.passive.tree = build_box_tree(m.boxes);
+        m.passive.tree = build_box_tree(m.passive_boxes);
     }
 
     void group() {
         const std::size_t count = static_cast<std::size_t>(object_count());
-        m.swept.resize(count);
         m.visited.resize(count);
         m.outcomes.assign(count, GroupOutcome{});
         m.dirty.assign(count, 1);
@@ -249,73 +231,30 @@ private:
             results.shifts.clear();
             results.blocked.clear();
         }
+        m.groups.start(object_count(), m.movers);
         const int dynamic_count = static_cast<int>(m.dynamic.size());
-        m.boxes.resize(m.dynamic.size());
         m_workspace.workers.for_each_range(dynamic_count, kBodiesARange, [&](int begin, int end, int) {
-            for (int k = begin; k < end; ++k) m.boxes[k] = m.swept[m.dynamic[k]] = body_box(m.dynamic[k]);
+            for (int k = begin; k < end; ++k)
+                m.groups.space(m.dynamic[k]) = space_of_body(m_model, m.bodies[m.dynamic[k]]);
         });
         for (int c = 0; c < m_model.cloth_count(); ++c) {
-            Box& box = m.swept[m_model.body_count() + c];
-            box = cloth_box(m_model.cloths[c]);
-            m.boxes.push_back(box);
+            m.groups.space(m_model.body_count() + c) =
+                space_of_cloth(m_model.cloths[c], m_state, m_control, m_parameters, m_model.thickness, m_options.dt);
         }
-        m.groups.reset(object_count());
-        if (m_options.global_zone) {
-            for (int i : m.movers) m.groups.unite(m.movers[0], i);
-            return;
-        }
-        for (const auto& [a, b] : overlapping_pairs(tree_of_movers())) m.groups.unite(m.movers[a], m.movers[b]);
-    }
-
-    /// A tree over m.boxes, which the threads share where there are many.
-    BoxTree tree_of_movers() {
-        BoxTreeBuilder builder(m.boxes, m.boxes.size() < kBodiesARange ? 0 : kTreeLevels);
-        m_workspace.workers.for_each_range(builder.part_count(), 1, [&](int begin, int end, int) {
-            for (int part = begin; part < end; ++part) builder.build_part(part);
-        });
-        return builder.finish();
-    }
-
-    /// Space for a body from where it is to where it went or would go.
-    Box body_box(int i) const {
-        const ZoneBody& moving = m.bodies[i];
-        const double radius = body(i).mesh.radius;
-        const double arc = std::max(sagitta(moving.target, radius), sagitta(moving.warm, radius));
-        const double reach = body(i).margin + 0.5 * m_model.thickness + arc;
-        Box box = swept_box({&body(i).mesh, {pose_at(moving, moving.warm), pose_at(moving, moving.target)}, reach});
-        Box start = transformed(body(i).mesh.tree.nodes[0].box, moving.start);
-        start.inflate(reach);
-        box.include(start);
-        return box;
-    }
-
-    /// Space for a cloth's nodes from where they are to where they went or would go.
-    Box cloth_box(const Cloth& cloth) const {
-        const double dt = m_options.dt;
-        Box box;
-        for (int k = 0; k < cloth.node_count(); ++k) {
-            const int node = cloth.first_node + k;
-            const Vec3 &x = m_state.node_position[node], &v = m_state.node_velocity[node];
-            box.include(x);
-            if (cloth.pinned[k]) {
-                box.include(x + dt * m_control.node_velocity[node]);
-                continue;
-            }
-            box.include(x + dt * v);
-            box.include(x + dt * (v + dt * m_parameters.gravity));
-        }
-        box.inflate(cloth.margin + 0.5 * m_model.thickness);
-        return box;
+        if (m_options.global_zone)
+            m.groups.unite_all();
+        else
+            m.groups.unite_overlapping(m_workspace.workers);
     }
 
     bool meets_ground(int i) const {
-        return m_model.ground.present && m.swept[i].lower.z() <= m_model.ground.height + m_model.ground.margin;
+        return m_model.ground.present && m.groups.space(i).lower.z() <= m_model.ground.height + m_model.ground.margin;
     }
 
     bool meets_passive(int i, std::vector<int>& near) const {
         if (m.passive.bodies.empty()) return false;
         near.clear();
-        query(m.passive.tree, m.swept[i], near);
+        query(m.passive.tree, m.groups.space(i), near);
         return !near.empty();
     }
 
@@ -323,23 +262,14 @@ private:
 
     /// Solve the groups marked dirty.
     void solve_groups() {
-        // Counting sort of the objects by group.
-        m.member_end.assign(static_cast<std::size_t>(object_count()) + 1, 0);
-        for (int i : m.movers) ++m.member_end[static_cast<std::size_t>(m.groups.find(i)) + 1];
-        std::partial_sum(m.member_end.begin(), m.member_end.end(), m.member_end.begin());
-        m.members.resize(m.movers.size());
-        for (int i : m.movers) m.members[m.member_end[m.groups.find(i)]++] = i;
         m.to_solve.clear();
-        int first = 0, size = 0;
-        for (int root = 0; root < object_count(); ++root) {
-            const int end = m.member_end[root];
-            if (first < end && m.dirty[root]) {
-                m.to_solve.push_back({root, first, end});
-                size += end - first;
-                if (m_model.is_cloth(m.members[end - 1])) size += kWorthSharing;
-            }
-            m.dirty[root] = 0;
-            first = end;
+        int size = 0;
+        for (const ObjectGroup& group : m.groups.sorted()) {
+            if (!m.dirty[group.root]) continue;
+            m.dirty[group.root] = 0;
+            m.to_solve.push_back(group);
+            size += group.end - group.first;
+            if (m_model.is_cloth(m.groups.members()[group.end - 1])) size += kWorthSharing;
         }
         // Which thread solves a group leaves no trace: memory of its own, and results in the order of the groups.
         const int count = static_cast<int>(m.to_solve.size());
@@ -357,24 +287,25 @@ private:
         });
     }
 
-    void solve_group(const Group& group, int thread) {
+    void solve_group(const ObjectGroup& group, int thread) {
         const auto [root, first, end] = group;
+        const std::vector<int>& members = m.groups.members();
         GroupResults& results = m.results[thread];
         GroupOutcome& outcome = m.outcomes[root];
         outcome = GroupOutcome{};
         if (end - first == 1 && !m_model.is_cloth(root) && !meets_ground(root) && !meets_passive(root, results.near)) {
             m.y.bodies[root] = m.bodies[root].target;
-            m.visited[root] = m.swept[root];
+            m.visited[root] = m.groups.space(root);
             return;
         }
         ZoneMemory& memory = m_workspace.zones[thread];
         Zone& zone = new_zone(memory, origin_of(root));
         for (int k = first; k < end; ++k) {  // sorted: bodies come before cloths
-            if (m_model.is_cloth(m.members[k])) {
-                add_cloth(zone, m.members[k] - m_model.body_count(), m_state, m_control, m_parameters);
+            if (m_model.is_cloth(members[k])) {
+                add_cloth(zone, members[k] - m_model.body_count(), m_state, m_control, m_parameters);
                 continue;
             }
-            zone.bodies.push_back(m.bodies[m.members[k]]);
+            zone.bodies.push_back(m.bodies[members[k]]);
             zone.bodies.back().start.t -= zone.origin;
         }
         zone.dynamic_count = zone.body_count();
@@ -390,7 +321,7 @@ private:
         if (outcome.result.status == ZoneStatus::bad_start)
             refuse_start(zone.contacts[outcome.result.worst_contact], point.distances[outcome.result.worst_contact]);
         for (int k = first; k < end; ++k) {
-            const int i = m.members[k];
+            const int i = members[k];
             m.visited[i] = memory.visited[k - first];
             m.visited[i].inflate(m_model.margin(i));
             m.visited[i].lower += zone.origin;
@@ -432,30 +363,15 @@ private:
             number(contact.range.rest) + " m; move them apart, for instance with sim.separate(state)");
     }
 
-    /// Bodies that were pushed out of the space reserved for them may have met others: such groups are joined, to be
-    /// solved again. False if there are none.
+    /// Groups whose objects were pushed to where they may have met others are to be solved again, together. False if there
+    /// are none.
     bool merge_met_groups() {
-        bool left = false;
-        for (int i : m.movers) {
-            left = left || (m.visited[i].lower.array() < m.swept[i].lower.array()).any() ||
-                   (m.visited[i].upper.array() > m.swept[i].upper.array()).any();
-        }
-        if (!left) return false;
-        m.boxes.clear();
-        for (int i : m.movers) {
-            m.swept[i].include(m.visited[i]);
-            m.boxes.push_back(m.swept[i]);
-        }
-        bool merged = false;
-        for (const auto& [a, b] : overlapping_pairs(tree_of_movers())) {
-            const int i = m.groups.find(m.movers[a]), j = m.groups.find(m.movers[b]);
-            if (i == j) continue;
-            m.groups.unite(i, j);
+        const auto joined = m.groups.include_visited(m.visited, m_workspace.workers);
+        for (const auto& [i, j] : joined) {
             m.outcomes[i] = m.outcomes[j] = GroupOutcome{};
             m.dirty[std::min(i, j)] = 1;
-            merged = true;
         }
-        return merged;
+        return !joined.empty();
     }
 
     /// What drives could not do for one zone they must not do for any.
@@ -586,44 +502,6 @@ std::size_t StepRecord::bytes() const {
             elastic_shift.capacity()) *
                sizeof(Vec3) +
            zones.bytes();
-}
-
-ZoneBody moving_body(
-    int id, const BodyState& state, const BodyControl& control, const Parameters& parameters,
-    const FreeRotation& rotation, double dt) {
-    ZoneBody body;
-    body.id = id;
-    body.start = {quaternion_to_matrix(state.orientation), state.position};
-    body.inertia = body.start.R * parameters.inertia[id] * body.start.R.transpose();
-    body.inverse_inertia = body.inertia.inverse();
-    body.mass = parameters.mass[id];
-    body.target << rotation.rotation, dt * free_velocity(id, state, control, parameters, dt);
-    body.warm << dt * state.angular_velocity, dt * state.velocity;
-    if (rotation.substeps == 0) body.warm.head<3>().setZero();  // it is held
-    return body;
-}
-
-void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters) {
-    const Cloth& cloth = zone.model->cloths[id];
-    ZoneCloth entry;
-    entry.id = id;
-    entry.first_node = zone.node_count();
-    entry.start = elastic_start(cloth, state.node_position.data() + cloth.first_node);
-    zone.cloths.push_back(std::move(entry));
-    for (int k = 0; k < cloth.node_count(); ++k) {
-        const int i = cloth.first_node + k;
-        ZoneNode node;
-        node.start = state.node_position[i] - zone.origin;
-        node.mass = parameters.cloths[id].density * cloth.node_area[k];
-        node.pinned = cloth.pinned[k] != 0;
-        const Vec3 velocity =
-            node.pinned
-                ? control.node_velocity[i]
-                : free_node_velocity(state.node_velocity[i], control.node_force[i], node.mass, parameters, zone.dt);
-        node.target = zone.dt * velocity;
-        node.warm = zone.dt * state.node_velocity[i];
-        zone.nodes.push_back(node);
-    }
 }
 
 SceneState step(

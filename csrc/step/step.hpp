@@ -8,9 +8,9 @@
 #include "contact/adjoint.hpp"
 #include "contact/touching_zones.hpp"
 #include "contact/zone_solver.hpp"
-#include "dynamics/free_motion.hpp"
 #include "model/state.hpp"
 #include "parallel/workers.hpp"
+#include "step/step_start.hpp"
 
 /// One time step and its backward: the only place that knows the whole order.
 namespace diffsim {
@@ -40,27 +40,6 @@ struct StepInfo {
     double seconds_motion = 0.0, seconds_broad_phase = 0.0, seconds_zones = 0.0;
     std::uint64_t signature = 0;  ///< hash of the active contacts and their types
 };
-
-/// A dynamic body at the start of a step, in the world frame: with R0 I_b R0ᵀ, the motion nothing hinders as target and
-/// last step's motion as warm start.
-ZoneBody moving_body(
-    int id, const BodyState& state, const BodyControl& control, const Parameters& parameters,
-    const FreeRotation& rotation, double dt);
-
-/// Append a cloth at the start of a step to a zone, whose origin and dt are set.
-void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters);
-
-/// Velocity at the end of a step in which nothing touches the body: v0 + dt (g + f / m).
-inline Vec3 free_velocity(
-    int id, const BodyState& state, const BodyControl& control, const Parameters& parameters, double dt) {
-    return state.velocity + dt * (parameters.gravity + control.force / parameters.mass[id]);
-}
-
-/// The same for a cloth node of this mass that nothing touches, not even its neighbours.
-inline Vec3 free_node_velocity(
-    const Vec3& velocity, const Vec3& force, double mass, const Parameters& parameters, double dt) {
-    return velocity + dt * (parameters.gravity + force / mass);
-}
 
 /// Objects penetrate in the state a step was to start from; says which.
 class PenetratingStart : public std::invalid_argument {

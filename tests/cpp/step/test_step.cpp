@@ -1,4 +1,4 @@
-#include "step.hpp"
+#include "step/step.hpp"
 
 #include <algorithm>
 #include <stdexcept>

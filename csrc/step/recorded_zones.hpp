@@ -1,6 +1,6 @@
 #pragma once
 
-#include "step.hpp"
+#include "step/step.hpp"
 
 namespace diffsim {
 

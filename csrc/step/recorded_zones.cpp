@@ -1,4 +1,4 @@
-#include "recorded_zones.hpp"
+#include "step/recorded_zones.hpp"
 
 #include <algorithm>
 

@@ -1,0 +1,76 @@
+#include "step/object_groups.hpp"
+
+#include <cstddef>
+#include <numeric>
+
+#include "geometry/box_tree.hpp"
+
+namespace diffsim {
+namespace {
+
+constexpr std::size_t kWorthSharing = 128;  // boxes: a tree over fewer is done before a thread has woken up
+constexpr int kTreeLevels = 2;              // above the parts of a tree that threads share
+
+}  // namespace
+
+void ObjectGroups::start(int object_count, const std::vector<int>& movers) {
+    m_movers = movers;
+    m_space.assign(static_cast<std::size_t>(object_count), Box());
+    m_groups.reset(object_count);
+}
+
+void ObjectGroups::unite_all() {
+    for (int i : m_movers) m_groups.unite(m_movers[0], i);
+}
+
+void ObjectGroups::unite_overlapping(Workers& workers) {
+    for (const auto& [a, b] : overlaps(workers)) m_groups.unite(m_movers[a], m_movers[b]);
+}
+
+std::vector<std::pair<int, int>> ObjectGroups::overlaps(Workers& workers) {
+    m_boxes.clear();
+    for (int i : m_movers) m_boxes.push_back(m_space[i]);
+    BoxTreeBuilder builder(m_boxes, m_boxes.size() < kWorthSharing ? 0 : kTreeLevels);
+    workers.for_each_range(builder.part_count(), 1, [&](int begin, int end, int) {
+        for (int part = begin; part < end; ++part) builder.build_part(part);
+    });
+    return overlapping_pairs(builder.finish());
+}
+
+std::vector<std::pair<int, int>> ObjectGroups::include_visited(const std::vector<Box>& visited, Workers& workers) {
+    bool left = false;
+    for (int i : m_movers) {
+        left = left || (visited[i].lower.array() < m_space[i].lower.array()).any() ||
+               (visited[i].upper.array() > m_space[i].upper.array()).any();
+    }
+    std::vector<std::pair<int, int>> joined;
+    if (!left) return joined;
+    for (int i : m_movers) m_space[i].include(visited[i]);
+    for (const auto& [a, b] : overlaps(workers)) {
+        const int i = m_groups.find(m_movers[a]), j = m_groups.find(m_movers[b]);
+        if (i == j) continue;
+        m_groups.unite(i, j);
+        joined.emplace_back(i, j);
+    }
+    return joined;
+}
+
+const std::vector<ObjectGroup>& ObjectGroups::sorted() {
+    // Counting sort.
+    const std::size_t object_count = m_space.size();
+    m_next.assign(object_count + 1, 0);
+    for (int i : m_movers) ++m_next[static_cast<std::size_t>(m_groups.find(i)) + 1];
+    std::partial_sum(m_next.begin(), m_next.end(), m_next.begin());
+    m_members.resize(m_movers.size());
+    for (int i : m_movers) m_members[m_next[m_groups.find(i)]++] = i;
+    m_sorted.clear();
+    int first = 0;
+    for (std::size_t root = 0; root < object_count; ++root) {
+        const int end = m_next[root];
+        if (first < end) m_sorted.push_back({static_cast<int>(root), first, end});
+        first = end;
+    }
+    return m_sorted;
+}
+
+}  // namespace diffsim
