@@ -1,9 +1,12 @@
 """Random scenes, simulated and differentiated: no NaN, no penetration, and how often a step did not converge.
 
     python tests/fuzz.py --scenes 200 --steps 300 --seed 0
+    python tests/fuzz.py --scenes 40 --steps 100 --bodies 4 --cloths 1 --gradients 20
 
-Each scene has ten bodies, convex and not, that fall on each other, every second time between four walls. Scene k of
-seed S is the same whatever the number of scenes: `--first k --scenes 1` runs it alone.
+Each scene has ten bodies, convex and not, that fall on each other, every second time between four walls; with --cloths
+sheets of random material among them, some of them pinned. With --gradients k the gradient of every k-th step is held
+against central differences: it is wrong if it agrees with those of no step size. Scene k of seed S is the same whatever
+the number of scenes: `--first k --scenes 1` runs it alone.
 """
 
 from __future__ import annotations
@@ -22,10 +25,12 @@ import torch
 import diffsim as ds
 
 sys.path.insert(0, str(Path(__file__).parent / "python"))
-from penetration import PenetrationCheck
+from penetration import CrossingCheck, PenetrationCheck
 
 DT = 0.01
 WALL = 0.1  # [m]
+DIFFERENCES = (1e-6, 1e-5, 3e-6, 3e-7, 1e-7)  # step sizes of central differences
+WRONG = 1e-4  # relative error of a derivative; differences have up to a hundredth of that of their own
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,7 @@ class Outcome:
     contacts: int  # in the last step
     seconds: float
     gradient: float  # largest entry
+    derivatives: int  # held against differences
 
 
 def add_random_body(scene: ds.Scene, rng: np.random.Generator, position: list[float], size: float, kind: str) -> None:
@@ -72,7 +78,28 @@ def add_random_body(scene: ds.Scene, rng: np.random.Generator, position: list[fl
         scene.add_body((vertices, faces), **options)
 
 
-def random_scene(seed: int, index: int, bodies: int) -> ds.Scene:
+def add_random_cloth(scene: ds.Scene, rng: np.random.Generator, position: list[float], size: float) -> None:
+    """A sheet within a ball of radius size."""
+    nodes = int(rng.integers(4, 10))  # along a side
+    material = ds.ClothMaterial.isotropic(
+        young=float(10.0 ** rng.uniform(4.0, 7.0)),
+        thickness=float(10.0 ** rng.uniform(-3.5, -2.5)),
+        density=float(10.0 ** rng.uniform(2.0, 3.2)),
+        poisson=0.3,
+        damping=float(rng.choice([0.0, 1e-4, 1e-3])),
+    )
+    corners = [0, nodes - 1, nodes * (nodes - 1), nodes**2 - 1]
+    scene.add_cloth(
+        ds.shapes.sheet(np.sqrt(2.0) * size, nodes),
+        material,
+        position=position,
+        orientation=rng.normal(size=4) * (1.0, 0.3, 0.3, 1.0),
+        velocity=tuple(rng.normal(size=3)),
+        pinned=corners[: rng.choice([0, 0, 1, 2, 4])],
+    )
+
+
+def random_scene(seed: int, index: int, bodies: int, cloths: int = 0) -> ds.Scene:
     rng = np.random.default_rng([seed, index])
     scene = ds.Scene()
     scene.add_ground()
@@ -88,18 +115,38 @@ def random_scene(seed: int, index: int, bodies: int) -> ds.Scene:
         kinds[0] = "static" if index % 8 >= 4 else "kinematic"
     placed: list[tuple[np.ndarray, float]] = []
     height = 1.0
-    while len(placed) < bodies:
+    while len(placed) < bodies + cloths:
         size = rng.uniform(0.15, 0.45)
         centre = rng.uniform([-half + 0.5, -half + 0.5, 0.5], [half - 0.5, half - 0.5, height])
         if all(np.linalg.norm(centre - x) > size + s + 0.02 for x, s in placed):
-            add_random_body(scene, rng, centre.tolist(), size, kinds[len(placed)])
+            if len(placed) < bodies:
+                add_random_body(scene, rng, centre.tolist(), size, kinds[len(placed)])
+            else:
+                add_random_cloth(scene, rng, centre.tolist(), size)
             placed.append((centre, size))
         height += 0.01  # so that there is room in the end
     return scene
 
 
-def run_scene(seed: int, index: int, bodies: int, steps: int) -> Outcome:
-    scene = random_scene(seed, index, bodies)
+def wrong_derivatives(sim: ds.Simulator, state: ds.State, control: ds.Control, seed: int) -> tuple[int, list[str]]:
+    """How many derivatives of one step could be held against differences, and those that agree with none of them."""
+    least: dict[int, tuple[float, str]] = {}  # per direction the smallest error over the step sizes
+    for eps in DIFFERENCES:
+        report = ds.diagnostics.gradcheck(sim, state, control, directions=1, eps=eps, seed=seed)
+        for k, found in enumerate(report.directions):
+            if found.active_set_changed:
+                continue
+            text = f"derivative by {found.name} is {found.derivative:g}, differences say {found.difference:g}"
+            if k not in least or found.error < least[k][0]:
+                least[k] = (found.error, text)
+        if least and all(error <= WRONG for error, _ in least.values()):
+            break
+    return len(least), [text for error, text in least.values() if error > WRONG]
+
+
+def run_scene(seed: int, index: int, bodies: int, cloths: int, steps: int, every: int) -> Outcome:
+    """`every`: steps from one that is held against differences to the next; 0 for none."""
+    scene = random_scene(seed, index, bodies, cloths)
     start = time.perf_counter()
     sim = ds.Simulator(scene, DT)
     generator = torch.Generator().manual_seed(index)
@@ -115,14 +162,19 @@ def run_scene(seed: int, index: int, bodies: int, steps: int) -> Outcome:
         "inertia": sim.inertia,
         "gravity": sim.gravity,
     }
+    fields = ["position", "orientation", "velocity", "angular_velocity"]
+    if cloths:
+        fields += ["node_position", "node_velocity"]
+        leaves |= {"node_position": state.node_position, "node_velocity": state.node_velocity}
+        leaves |= {name: getattr(sim, name) for name in ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend")}
     for leaf in leaves.values():
         leaf.requires_grad_()
     try:
         trajectory = sim.rollout(state, ds.Control(force=force), steps)
     except ValueError as error:  # it refuses a state that it made itself
-        return Outcome([str(error)], 0, 0, time.perf_counter() - start, 0.0)
+        return Outcome([str(error)], 0, 0, time.perf_counter() - start, 0.0, 0)
     loss = torch.zeros((), dtype=torch.float64)
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
+    for name in fields:
         value = getattr(trajectory, name)[-1]
         loss = loss + (value * torch.randn(value.shape, generator=generator, dtype=torch.float64)).sum()
     gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values()))))
@@ -130,15 +182,26 @@ def run_scene(seed: int, index: int, bodies: int, steps: int) -> Outcome:
 
     problems = [f"gradient of {name} is not finite" for name, g in gradients.items() if not bool(g.isfinite().all())]
     problems += [f"gradient of {name} is zero" for name, g in gradients.items() if not g.any()]
-    for name in ("position", "orientation", "velocity", "angular_velocity"):
+    for name in fields:
         if not bool(getattr(trajectory, name).isfinite().all()):
             problems.append(f"{name} is not finite")
-    check = PenetrationCheck(scene, sim.thickness)
-    for step, frame in enumerate(trajectory.detach()):
-        problems += [f"after step {step + 1}: {text}" for text in check.problems(sim, frame)]
     assert sim.info is not None
+    failed, contacts = sim.info.failed_steps, sim.info.contacts
     largest = max(float(g.abs().max()) for g in gradients.values())
-    return Outcome(problems, sim.info.failed_steps, sim.info.contacts, seconds, largest)
+
+    checks = [PenetrationCheck(scene, sim.thickness)] + [CrossingCheck(scene, sim.thickness)] * bool(cloths)
+    derivatives = 0
+    for step, frame in enumerate(trajectory.detach(), 1):
+        found = [text for check in checks for text in check.problems(sim, frame)]
+        if every and step % every == 0:
+            with torch.no_grad():
+                sim(frame, ds.Control(force=force))
+            if sim.info.converged:  # else the step ended short of what is differentiated
+                count, wrong = wrong_derivatives(sim, frame, ds.Control(force=force), step)
+                derivatives += count
+                found += wrong
+        problems += [f"after step {step}: {text}" for text in found]
+    return Outcome(problems, failed, contacts, seconds, largest, derivatives)
 
 
 def main() -> int:
@@ -146,13 +209,18 @@ def main() -> int:
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--bodies", type=int, default=10)
+    parser.add_argument("--cloths", type=int, default=0)
+    parser.add_argument("--gradients", type=int, default=0, help="every so many steps")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="index of the first scene")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", ds.ConvergenceWarning)  # they are counted instead
-    bad, failed, unconverged_scenes, begin = 0, 0, 0, time.perf_counter()
+    bad, failed, unconverged_scenes, derivatives, begin = 0, 0, 0, 0, time.perf_counter()
     for index in range(arguments.first, arguments.first + arguments.scenes):
-        outcome = run_scene(arguments.seed, index, arguments.bodies, arguments.steps)
+        outcome = run_scene(
+            arguments.seed, index, arguments.bodies, arguments.cloths, arguments.steps, arguments.gradients
+        )
+        derivatives += outcome.derivatives
         bad += bool(outcome.problems)
         failed += outcome.failed_steps
         unconverged_scenes += outcome.failed_steps > 0
@@ -166,7 +234,8 @@ def main() -> int:
     print(
         f"{arguments.scenes} scenes of {arguments.bodies} bodies and {arguments.steps} steps in"
         f" {time.perf_counter() - begin:.0f} s: {bad} scenes with problems; {failed} of"
-        f" {arguments.scenes * arguments.steps} steps in {unconverged_scenes} scenes did not converge"
+        f" {arguments.scenes * arguments.steps} steps in {unconverged_scenes} scenes did not converge;"
+        f" {derivatives} derivatives held against differences"
     )
     return 1 if bad else 0
 

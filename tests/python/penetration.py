@@ -51,6 +51,13 @@ def point_triangle_distance(point: FloatArray, triangles: FloatArray) -> FloatAr
     return np.asarray(np.where(np.min(beside, axis=0) >= 0.0, above, to_edges))
 
 
+def axis_distance(axis: FloatArray, triangles: FloatArray) -> float:
+    """Distance of a segment from triangles that it does not cross, shapes (2, 3) and (n, 3, 3) [m]."""
+    edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
+    found = [segment_distance(axis, edges).min(), *(point_triangle_distance(x, triangles).min() for x in axis)]
+    return float(min(found))
+
+
 def winding_number(point: FloatArray, triangles: FloatArray) -> float:
     """How often a closed surface goes around a point: 1 inside, 0 outside."""
     corners = triangles - point
@@ -139,7 +146,52 @@ class PenetrationCheck:
         axis = world[self._vertices[i]][[0, -1]]
         if j in self._round:
             return float(segment_distance(axis, world[self._vertices[j]][[0, -1]]))
-        triangles = self._triangles(j, world)
-        edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
-        found = [segment_distance(axis, edges).min(), *(point_triangle_distance(x, triangles).min() for x in axis)]
-        return float(min(found))
+        return axis_distance(axis, self._triangles(j, world))
+
+
+class CrossingCheck:
+    """Whether triangles of bodies and cloths cross, a node is in the ground, or a sphere or capsule in a cloth.
+
+    Bodies that do not yield may cross each other.
+    """
+
+    def __init__(self, scene: ds.Scene, thickness: float) -> None:
+        p = self._packed = scene.pack(thickness)
+        body_first = np.cumsum(p.vertex_count) - p.vertex_count
+        self._first_node = int(sum(p.vertex_count))
+        node_first = np.cumsum(p.node_count) - p.node_count + self._first_node
+        faces = p.faces.reshape(-1, 3) + np.repeat(body_first, p.face_count)[:, None]
+        owner = np.repeat(np.arange(len(p.names)), p.face_count)
+        self._triangles = p.triangles + np.repeat(node_first, p.triangle_count)[:, None]
+        yielding = np.asarray(p.kind)[owner] == 0
+        moving = np.concatenate([faces[yielding], self._triangles])
+        rest = np.concatenate([p.vertices, p.node_rest])
+        self._meshes = []
+        for body in np.unique(owner[~yielding]) if not yielding.all() else [-1]:
+            together = np.concatenate([moving, faces[owner == body]]).astype(np.int32)
+            self._meshes.append(ipctk.CollisionMesh(rest, ipctk.edges(together), together))
+        self._round = [
+            (body, slice(first, first + count))
+            for body, (first, count) in enumerate(zip(body_first, p.vertex_count))
+            if p.face_count[body] == 0
+        ]
+
+    def problems(self, sim: ds.Simulator, state: ds.State) -> list[str]:
+        """What is wrong with one state, in words; empty if all is well."""
+        p, found = self._packed, []
+        with torch.no_grad():
+            world = sim.vertices(state).numpy()
+        if not np.isfinite(world).all():
+            return ["not finite"]
+        if any(ipctk.has_intersections(mesh, world) for mesh in self._meshes):
+            found.append("ipctk: surfaces intersect")
+        nodes = world[self._first_node :]
+        free = np.asarray(p.pinned) == 0
+        if p.has_ground and nodes[free, 2].min(initial=np.inf) <= p.ground_height:
+            found.append(f"a node is {nodes[free, 2].min() - p.ground_height:g} m above the ground")
+        for body, vertices in self._round:
+            distance = axis_distance(world[vertices][[0, -1]], world[self._triangles])
+            # Contact gives way by less than the thickness, of which the cloth's margin is half.
+            if distance < p.margin[body] - 0.5 * p.thickness:
+                found.append(f"{p.names[body]} is {distance:g} m from a triangle, less than its radius")
+        return found

@@ -8,10 +8,9 @@ import pickle
 import warnings
 from typing import Any
 
-import ipctk
-import numpy as np
 import pytest
 import torch
+from penetration import CrossingCheck
 from test_cloth_gradients import folded_sheet, rim
 from torch import Tensor
 
@@ -19,43 +18,6 @@ import diffsim as ds
 
 MATERIAL = ds.ClothMaterial(density=0.2, stretch=500.0, shear=60.0, bend=1e-5, damping=0.02)
 FIELDS = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
-
-
-class IntersectionCheck:
-    """Whether any two triangles of a scene cross, of bodies and cloths, or a node is in the ground or a ball."""
-
-    def __init__(self, scene: ds.Scene, thickness: float) -> None:
-        p = self._packed = scene.pack(thickness)
-        body_first = np.cumsum(p.vertex_count) - p.vertex_count
-        node_first = np.cumsum(p.node_count) - p.node_count + int(sum(p.vertex_count))
-        faces = [
-            p.faces.reshape(-1, 3) + np.repeat(body_first, p.face_count)[:, None],
-            p.triangles + np.repeat(node_first, p.triangle_count)[:, None],
-        ]
-        self._faces = np.concatenate(faces).astype(np.int32)
-        self._rest = np.concatenate([p.vertices, p.node_rest])
-        self._mesh = ipctk.CollisionMesh(self._rest, ipctk.edges(self._faces), self._faces)
-        self._balls = [(i, int(body_first[i])) for i in range(len(p.names)) if p.vertex_count[i] == 1]
-        self._first_node = int(sum(p.vertex_count))
-
-    def problems(self, sim: ds.Simulator, state: ds.State) -> list[str]:
-        p, found = self._packed, []
-        with torch.no_grad():
-            world = sim.vertices(state).numpy()
-        if not np.isfinite(world).all():
-            return ["not finite"]
-        if ipctk.has_intersections(self._mesh, world):
-            found.append("ipctk: surfaces intersect")
-        nodes = world[self._first_node :]
-        if p.has_ground and nodes[:, 2].min() <= p.ground_height:
-            found.append(f"a node is {nodes[:, 2].min() - p.ground_height:g} m above the ground")
-        for body, vertex in self._balls:
-            squared = [ipctk.point_triangle_distance(world[vertex], *corners) for corners in world[self._faces]]
-            distance = float(np.sqrt(min(squared)))
-            # Contact gives way by less than the thickness, of which the cloth's margin is half.
-            if distance < p.margin[body] - 0.5 * p.thickness:
-                found.append(f"{p.names[body]} is {distance:g} m from a triangle, less than its radius")
-        return found
 
 
 def fall(onto: str) -> ds.Scene:
@@ -92,7 +54,7 @@ FALLS = [
 def test_falling_cloth_goes_through_nothing(onto: str, coupling: str, dt: float) -> None:
     scene = fall(onto)
     sim = ds.Simulator(scene, dt, coupling=coupling, on_failure="raise" if coupling == "monolithic" else "warn")
-    check = IntersectionCheck(scene, sim.thickness)
+    check = CrossingCheck(scene, sim.thickness)
     state, contacts = sim.initial_state(), 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ds.ConvergenceWarning)  # split may fail; what is judged is where things are
@@ -119,7 +81,7 @@ def test_nothing_fast_passes_a_pinned_sheet(shape: str, speed: float, dt: float)
     else:
         scene.add_body(ds.shapes.box(0.15), orientation=(1, 0.2, 0.3, 0.1), **options)
     sim = ds.Simulator(scene, dt)
-    check = IntersectionCheck(scene, sim.thickness)
+    check = CrossingCheck(scene, sim.thickness)
     state, hit = sim.initial_state(), False
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ds.ConvergenceWarning)
@@ -208,7 +170,7 @@ def test_threads_copies_gradients_and_resuming_change_no_bit(coupling: str) -> N
 def test_the_judge_sees_what_it_must() -> None:
     scene = fall("sphere")
     sim = ds.Simulator(scene, 0.01)
-    check = IntersectionCheck(scene, sim.thickness)
+    check = CrossingCheck(scene, sim.thickness)
     state = sim.initial_state()
     assert check.problems(sim, state) == []
     down = torch.tensor([0.0, 0.0, -0.2], dtype=torch.float64)

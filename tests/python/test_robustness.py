@@ -32,6 +32,16 @@ def test_random_scenes() -> None:
     assert ": 0 scenes with problems" in found.stdout
 
 
+def test_derivatives_in_random_scenes_with_cloth() -> None:
+    """No derivative of a step disagrees with central differences of every step size."""
+    options = ["--scenes", "3", "--steps", "60", "--bodies", "4", "--cloths", "1", "--gradients", "20"]
+    found = subprocess.run([sys.executable, str(FUZZ), *options], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    assert ": 0 scenes with problems" in found.stdout
+    derivatives = int(found.stdout.rsplit("; ", 1)[1].split()[0])
+    assert derivatives > 50
+
+
 # ---- squeezes --------------------------------------------------------------------------------------------------------
 
 
