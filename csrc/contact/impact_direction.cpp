@@ -147,7 +147,7 @@ ImpactDirection impact_direction(
     Placement impact_at = now;
     std::vector<double> mass_factor(static_cast<std::size_t>(count), 1.0);
     std::optional<ImpactForces> forces;
-    if (cloth != nullptr) {
+    if (cloth != nullptr && zone.elastic) {  // without elasticity its matrix is diagonal, and the rows' own is sparse
         forces.emplace(zone, gradient, cloth_system);
         if (before != nullptr) forces->start_from(rows, difference(before->y_end, point.y));
     }
