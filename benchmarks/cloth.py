@@ -1,26 +1,25 @@
 """Cloth: square sheets of 21 x 21, 51 x 51, 101 x 101 nodes fall on a fixed sphere; dt 0.01 s, one thread.
 
-Beside MuJoCo's flex and Newton's VBD on the CPU, in the same run, in turns: same mesh width, same step, a sheet of
+Beside MuJoCo's flex and Newton's VBD on the CPU, in the same run, in turns: same mesh, masses and step, a sheet of
 rubber-like material (Young's modulus 5 MPa, 1 mm, Poisson's ratio 0.3). Each simulator's steps before and after its own
 first contact are counted apart, since their costs differ; "step" is the mean over both. Self-contact is on in ours and
 in MuJoCo; in VBD it is off, since there it lets nodes move no further per step than about half the distance at which
-it looks for contacts: with one of two thicknesses the sheet falls at 0.09 m/s.
+it looks for contacts: with one of two thicknesses the sheet falls at 0.09 m/s. In all, its faces meet the sphere, too.
 
 Ours is timed through `Simulator.rollout`, one for each of the two phases, with gradients to the state and the material;
-the peers have no backward here. Newton iterations are ours; VBD takes the ten of its default, converged or not.
+the peers have no backward here. Newton iterations are ours; VBD takes the ten of its default, converged or not. What
+errors these times buy: `cloth_accuracy.py`.
 
 Prints one CSV line per mesh, medians over rounds, and the log-log slopes of time against nodes; draws out/cloth.png.
 Targets: forward faster than both peers (ratios below 1), backward at most 1.0 of forward, slopes at most 1.25.
 
-Contact is frictionless in all. MuJoCo's contacts are soft, and so are VBD's: how far nodes go into the sphere at most
-stands in the columns `depth`. Needs the extra `bench`; without `newton` its columns are empty.
+Contact is frictionless in all. MuJoCo's contacts are soft, and so are VBD's: how far the middle of the sheet's
+thickness goes into the sphere at most stands in the columns `depth`. Needs the extra `bench`; without `newton` its
+columns are empty.
 """
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import io
 import math
 import statistics
 import sys
@@ -30,19 +29,16 @@ from functools import partial
 from typing import Any
 
 import mujoco
-import numpy as np
 import torch
+from _cloth_scenes import RADIUS, THICK, Sheet, VbdSheet, make_flex, make_simulator, raise_if_unstable, why_no_newton
 from _common import Clock, Table, draw_curves, make_parser, print_header, print_slopes, save_plot
 
 import diffsim as ds
 
 NODES = (21, 51, 101)  # along a side
 DT = 0.01
-SIDE, RADIUS, GAP = 1.0, 0.25, 0.05  # of the sheet, of the sphere, and between them at the start [m]
-YOUNG, THICK, DENSITY, POISSON = 5.0e6, 1.0e-3, 374.0, 0.3  # [Pa], [m], [kg/m³]
-DAMPING = 5.0e-4  # [s]
-HEIGHT = RADIUS + GAP + 0.5 * THICK  # of the sheet over the sphere's centre [m]
-ASIDE = (0.013, 0.007)  # of it: a sheet that falls dead centre stays on the saddles of its buckling [m]
+GAP = 0.05  # between the sheet and the sphere at the start [m]
+ASIDE = (0.013, 0.007)  # of the sheet's middle: one that falls dead centre stays on the saddles of its buckling [m]
 
 PHASES = ("flight", "contact", "step")
 PEERS = ("mujoco", "vbd")
@@ -51,7 +47,7 @@ MATERIAL = ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend", "clot
 
 @dataclass
 class Times:
-    """Milliseconds per step before and after the first contact, and over all steps; how deep nodes went [m]."""
+    """Milliseconds per step before and after the first contact, and over all steps; how deep the sheet went [m]."""
 
     flight: float
     contact: float
@@ -65,8 +61,8 @@ def mean_times(milliseconds: list[float], touched: list[bool], depth: float) -> 
     return Times(*(statistics.fmean(part) if part else math.nan for part in parts), depth)
 
 
-def depth_in_sphere(positions: np.ndarray) -> float:
-    return float(max(RADIUS - np.linalg.norm(positions, axis=-1).min(), 0.0))
+def make_sheet(nodes: int) -> Sheet:
+    return Sheet(nodes, (*ASIDE, RADIUS + GAP + 0.5 * THICK))
 
 
 # ---- ours ------------------------------------------------------------------------------------------------------------
@@ -77,12 +73,8 @@ class Ours:
 
     def __init__(self, nodes: int, steps: int) -> None:
         self.steps = steps
-        scene = ds.Scene(gravity=(0.0, 0.0, -9.81))
-        scene.add_sphere(RADIUS, density=1000.0, kind="static")
-        material = ds.ClothMaterial.isotropic(YOUNG, THICK, DENSITY, POISSON, DAMPING)
-        sheet = ds.shapes.sheet(SIDE, nodes)
-        scene.add_cloth(sheet, material, position=(*ASIDE, HEIGHT), margin=0.5 * THICK)
-        self.sim = ds.Simulator(scene, dt=DT, num_threads=1)
+        sheet = make_sheet(nodes)
+        self.sim = make_simulator(sheet, DT)
         for name in MATERIAL:
             getattr(self.sim, name).requires_grad_()
         states = [self.sim.initial_state()]
@@ -98,7 +90,7 @@ class Ours:
                 self.iterations.append(info.iterations)
                 self.failed += info.failed_steps
                 touched.append(info.contacts > 0)
-                depth = max(depth, depth_in_sphere(states[-1].node_position.numpy()))
+                depth = max(depth, -sheet.gap(states[-1].node_position.numpy()))
         self.first = touched.index(True)
         self.starts = {"flight": states[0], "contact": states[self.first]}
         self.counts = {"flight": self.first, "contact": steps - self.first}
@@ -138,16 +130,8 @@ class Flex:
 
     def __init__(self, nodes: int, steps: int) -> None:
         self.steps = steps
-        spacing = SIDE / (nodes - 1)
-        # "discrete" integrates the stiffness of flexes implicitly.
-        sheet = f'young="{YOUNG}" poisson="{POISSON}" thickness="{THICK}" elastic2d="both" damping="{DAMPING}"'
-        self.model = mujoco.MjModel.from_xml_string(
-            f'<mujoco><size memory="2G"/><option timestep="{DT}" gravity="0 0 -9.81" integrator="discrete"/><worldbody>'
-            f'<geom type="sphere" size="{RADIUS}" condim="1"/>'
-            f'<flexcomp name="sheet" type="grid" dim="2" count="{nodes} {nodes} 1" spacing="{spacing} {spacing} 1"'
-            f' pos="{ASIDE[0]} {ASIDE[1]} {HEIGHT}" radius="{0.5 * THICK}" mass="{DENSITY * THICK * SIDE**2}">'
-            f'<elasticity {sheet}/><contact selfcollide="auto" condim="1"/></flexcomp></worldbody></mujoco>'
-        )
+        self.sheet = make_sheet(nodes)
+        self.model = make_flex(self.sheet, DT)
 
     def measure(self, clock: Clock) -> dict[str, Times]:
         data = mujoco.MjData(self.model)
@@ -157,9 +141,8 @@ class Flex:
             mujoco.mj_step(self.model, data)
             milliseconds.append(1e3 * (clock() - begin))
             touched.append(bool(data.ncon > 0))
-            depth = max(depth, depth_in_sphere(data.flexvert_xpos))
-        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:  # MuJoCo starts again from the beginning there
-            raise RuntimeError("MuJoCo became unstable")
+            depth = max(depth, -self.sheet.gap(data.flexvert_xpos))
+        raise_if_unstable(data)
         return {"mujoco": mean_times(milliseconds, touched, depth)}
 
 
@@ -167,82 +150,24 @@ class Flex:
 
 
 class Vbd:
-    """The sheet in Newton's VBD solver, its step captured as a graph. Single precision."""
+    """The sheet in Newton's VBD solver."""
 
     def __init__(self, nodes: int, steps: int) -> None:
         self.steps = steps
-        import newton
-        import warp
-
-        self.warp = warp
-        cell = SIDE / (nodes - 1)
-        lame, shear = YOUNG * THICK * POISSON / (1.0 - POISSON**2), YOUNG * THICK / (2.0 * (1.0 + POISSON))
-        bend = YOUNG * THICK**3 / (12.0 * (1.0 - POISSON**2))
-        builder = newton.ModelBuilder(gravity=(0.0, 0.0, -9.81))
-        builder.add_cloth_grid(
-            pos=warp.vec3(ASIDE[0] - 0.5 * SIDE, ASIDE[1] - 0.5 * SIDE, HEIGHT),
-            rot=warp.quat_identity(),
-            vel=warp.vec3(0.0, 0.0, 0.0),
-            dim_x=nodes - 1,
-            dim_y=nodes - 1,
-            cell_x=cell,
-            cell_y=cell,
-            mass=DENSITY * THICK * SIDE**2 / nodes**2,
-            tri_ke=shear,
-            tri_ka=lame,
-            tri_kd=DAMPING * shear,
-            edge_ke=1.2 * bend / cell,  # its hinges alone bend a grid of squares with 5/6 of their stiffness
-            edge_kd=0.0,
-            particle_radius=0.5 * THICK,
-        )
-        builder.add_shape_sphere(-1, radius=RADIUS)
-        builder.color(include_bending=True)
-        self.model = builder.finalize()
-        self.model.soft_contact_ke, self.model.soft_contact_kd, self.model.soft_contact_mu = 1.0e4, 1.0e-4, 0.0
-        self.solver = newton.solvers.SolverVBD(self.model)
-        self.pipeline = newton.CollisionPipeline(self.model)
-        self.contacts = self.pipeline.contacts()
-        self.start, self.state, self.next = self.model.state(), self.model.state(), self.model.state()
-        self.control = self.model.control()
-        self.step()  # compiles its kernels
-        with warp.ScopedCapture() as capture:
-            self.step()
-        self.graph = capture.graph
-
-    def step(self) -> None:
-        self.state.clear_forces()
-        self.pipeline.collide(self.state, self.contacts)
-        self.solver.step(self.state, self.next, self.control, self.contacts, DT)
-        self.state.assign(self.next)
+        self.sheet = make_sheet(nodes)
+        self.vbd = VbdSheet(self.sheet, DT)
 
     def measure(self, clock: Clock) -> dict[str, Times]:
-        self.state.assign(self.start)
+        self.vbd.reset()
         milliseconds, touched, depth = [], [], 0.0
         for _ in range(self.steps):
             begin = clock()
-            self.warp.capture_launch(self.graph)
+            self.vbd.step()
             milliseconds.append(1e3 * (clock() - begin))
-            positions = self.state.particle_q.numpy()
-            touched.append(bool(np.linalg.norm(positions, axis=1).min() < RADIUS + THICK))
-            depth = max(depth, depth_in_sphere(positions))
+            gap = self.sheet.gap(self.vbd.positions)
+            touched.append(gap < THICK)
+            depth = max(depth, -gap)
         return {"vbd": mean_times(milliseconds, touched, depth)}
-
-
-def why_no_newton() -> str | None:
-    """None if Newton runs here."""
-    if importlib.util.find_spec("newton") is None:
-        return "newton is not installed (pip install newton)"
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            import warp
-
-            warp.config.quiet = True
-            warp.init()
-            warp.set_device("cpu")
-            Vbd(3, 1)
-    except Exception as error:  # whatever keeps it from running must not keep us from it
-        return f"newton does not run here: {type(error).__name__}: {error}"
-    return None
 
 
 # ---- the table -------------------------------------------------------------------------------------------------------
