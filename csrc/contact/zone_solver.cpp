@@ -21,6 +21,7 @@ constexpr int kStagnantSteps = 6;    // without halving the residual: rounding's
 constexpr CutShare kSmallestCut = 1.0 / 256.0;
 constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
 constexpr double kCutFactor = 4.0;
+constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
@@ -230,7 +231,8 @@ private:
         for (;;) {
             differentiate(m_zone, m_w.point, Curvature::full, m_w.derivatives, &m_w.system, m_cut);
             m_factor_is_exact = m_cut == kNothingCut;
-            if (m_w.system.factorize()) break;
+            m_has_factor = m_w.system.factorize();
+            if (m_has_factor) break;
             if (m_cut == kAllCut) return false;
             failed = true;
             m_cut = m_cut == kNothingCut ? kFirstCut : std::min(kCutFactor * m_cut, kAllCut);
@@ -322,24 +324,30 @@ private:
         return false;
     }
 
-    /// Whether the gradient alone says that a Newton step reached the minimum. If so, takes the step past the tolerance with
-    /// the factor at hand: the next one would only show the same. The gradient is worth its price where factors are dear,
-    /// with cloth, and where the line search has it anyway.
+    /// Whether the gradient alone says that a Newton step reached the minimum, or came so near that further steps with
+    /// the factor at hand reach it. If so, takes the last of them past the tolerance: another factor would only show the
+    /// same. The gradient is worth its price where factors are dear, with cloth, and where the line search has it anyway.
     bool finish_with_this_factor() {
         const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
-        if (!m_factor_is_exact || !(with_cloth || m_trial_is_differentiated)) return false;
+        if (!m_has_factor || !(with_cloth || (m_factor_is_exact && m_trial_is_differentiated))) return false;
         const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
-        if (m_trial_is_differentiated)
-            std::swap(m_w.derivatives, m_w.trial_derivatives);
-        else
-            differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
-        m_w.derivatives.largest_stiffness = stiffness;
-        const Accuracy now = accuracy();
-        if (!(now.residual < std::max(m_options.tolerance, now.floor)) || !solve_for_step()) return false;
-        set_step_end();
-        m_result.residual = now.residual;
-        polish();
-        return true;
+        for (double before = m_result.residual;;) {
+            if (m_trial_is_differentiated)
+                std::swap(m_w.derivatives, m_w.trial_derivatives);
+            else
+                differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+            m_trial_is_differentiated = false;
+            m_w.derivatives.largest_stiffness = stiffness;
+            const Accuracy now = accuracy();
+            const bool done = now.residual < std::max(m_options.tolerance, now.floor);
+            if (!done && !(with_cloth && now.residual < kContraction * before)) return false;
+            if (!solve_for_step()) return false;
+            set_step_end();
+            m_result.residual = before = now.residual;
+            const bool moved = polish();
+            if (done) return true;
+            if (!moved) return false;
+        }
     }
 
     /// Where the Newton step ends.
@@ -424,7 +432,7 @@ private:
 
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
     double past_impacts(double newton_limit, bool driven) {
-        m_factor_is_exact = false;  // the QP factorizes its own matrix
+        m_has_factor = false;  // the QP factorizes its own matrix
         Coordinates target = y();
         set_to_targets(target);
         ensure_covered(target);
@@ -473,14 +481,17 @@ private:
         return step > 0.0 && clear_step(m_w.y_end) > 0.0 ? DriveProgress::moved : DriveProgress::waits;
     }
 
-    /// One more full Newton step, past the tolerance: it takes the solution to rounding, which gradients feel.
-    void polish() {
-        if (m_w.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return;
-        if (!is_covered(m_zone, m_coverage, m_w.y_end)) return;
-        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return;
+    /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel. False if there
+    /// is nothing to gain.
+    bool polish() {
+        if (m_w.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return false;
+        if (!is_covered(m_zone, m_coverage, m_w.y_end)) return false;
+        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial);
-        if (m_w.trial.energy <= m_w.point.energy + energy_noise()) accept_trial();
+        if (!(m_w.trial.energy <= m_w.point.energy + energy_noise())) return false;
+        accept_trial();
+        return true;
     }
 
     /// Multiplier updates [the method of multipliers]: shift each contact's rest distance by its compression, so that the
@@ -516,7 +527,8 @@ private:
     std::vector<ImpactGate> m_gates;
     double m_position = 0.0;                 // size of the numbers that distances are differences of [m]
     CutShare m_cut = kNothingCut;            // of the next Newton step
-    bool m_factor_is_exact = false;          // the system's, of the exact Hessian
+    bool m_has_factor = false;               // the system, of the Hessian of the last Newton step
+    bool m_factor_is_exact = false;          // without anything cut off
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
     bool m_rescue = false;                   // some objects start the step below their floor
     ZoneResult m_result;
