@@ -14,8 +14,8 @@ Prints one CSV line per mesh, medians over rounds, and the log-log slopes of tim
 Targets: forward faster than both peers (ratios below 1), backward at most 1.0 of forward, slopes at most 1.25.
 
 Contact is frictionless in all. MuJoCo's contacts are soft, and so are VBD's: how far the middle of the sheet's
-thickness goes into the sphere at most stands in the columns `depth`. Needs the extra `bench`; without `newton` its
-columns are empty.
+thickness goes into the sphere at most stands in the columns `depth`. "mujoco_ipc" is MuJoCo with the flag that keeps
+surfaces apart, as ours does. Needs the extra `bench`; without `newton` its columns are empty.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ GAP = 0.05  # between the sheet and the sphere at the start [m]
 ASIDE = (0.013, 0.007)  # of the sheet's middle: one that falls dead centre stays on the saddles of its buckling [m]
 
 PHASES = ("flight", "contact", "step")
-PEERS = ("mujoco", "vbd")
+PEERS = ("mujoco", "mujoco_ipc", "vbd")
 MATERIAL = ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend", "cloth_damping")
 
 
@@ -128,10 +128,11 @@ class Ours:
 class Flex:
     """The sheet as a MuJoCo flex."""
 
-    def __init__(self, nodes: int, steps: int) -> None:
+    def __init__(self, nodes: int, steps: int, ipc: bool = False) -> None:
+        self.name = "mujoco_ipc" if ipc else "mujoco"
         self.steps = steps
         self.sheet = make_sheet(nodes)
-        self.model = make_flex(self.sheet, DT)
+        self.model = make_flex(self.sheet, DT, ipc=ipc)
 
     def measure(self, clock: Clock) -> dict[str, Times]:
         data = mujoco.MjData(self.model)
@@ -140,10 +141,11 @@ class Flex:
             begin = clock()
             mujoco.mj_step(self.model, data)
             milliseconds.append(1e3 * (clock() - begin))
-            touched.append(bool(data.ncon > 0))
-            depth = max(depth, -self.sheet.gap(data.flexvert_xpos))
+            gap = self.sheet.gap(data.flexvert_xpos)
+            touched.append(gap < THICK)
+            depth = max(depth, -gap)
         raise_if_unstable(data)
-        return {"mujoco": mean_times(milliseconds, touched, depth)}
+        return {self.name: mean_times(milliseconds, touched, depth)}
 
 
 # ---- Newton ----------------------------------------------------------------------------------------------------------
@@ -227,7 +229,8 @@ class Mesh:
 def draw(rows: list[dict[str, Any]], figure: Any) -> None:
     nodes = [row["nodes"] for row in rows]
     for axes, phase in zip(figure.subplots(1, len(PHASES), sharey=True), PHASES):
-        names = {"diffsim, forward": "forward", "diffsim, backward": "backward", "MuJoCo": "mujoco", "VBD": "vbd"}
+        names = {"diffsim, forward": "forward", "diffsim, backward": "backward", "VBD": "vbd"}
+        names |= {"MuJoCo": "mujoco", "MuJoCo, ipc": "mujoco_ipc"}
         curves = {label: (nodes, [row[f"{name}_{phase}_ms"] for row in rows]) for label, name in names.items()}
         draw_curves(axes, curves, "nodes", "ms per step")
         axes.set_title("all steps" if phase == "step" else phase)
@@ -245,7 +248,7 @@ def main() -> int:
     print_header("mujoco", "newton", "warp-lang", clock=options.clock)
     makers: list[Any] = []
     if not options.no_peers:
-        makers.append(Flex)
+        makers += [Flex, partial(Flex, ipc=True)]
         why_not = why_no_newton()
         if why_not is None:
             makers.append(Vbd)
