@@ -1,6 +1,7 @@
 #pragma once
 
 #include <optional>
+#include <vector>
 
 #include "contact/impact_direction.hpp"
 
@@ -38,6 +39,7 @@ struct ZoneWorkspace {
     BlockSystem system;
     ContactCoverage coverage;
     Coordinates step, y_end;
+    std::vector<double> pushed;  ///< sum of the contact forces on each body
     Box swept;
 };
 
