@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <random>
 
 #include "contact/impact_gate.hpp"
 
@@ -22,6 +24,7 @@ constexpr CutShare kSmallestCut = 1.0 / 256.0;
 constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
 constexpr double kCutFactor = 4.0;
 constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
+constexpr double kUnsettling = 1e-10;      // of the largest force: as little as the tolerance lets pass
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
@@ -223,10 +226,28 @@ private:
         return std::sqrt(turn.dot(turn_metric * turn) + shift_metric * v.tail<3>().squaredNorm());
     }
 
-    /// The Newton step, from the exact Hessian where that is positive definite. Else negative curvature is cut off. With
-    /// cloth no more than needed, since it is what a sheet follows when it buckles: the share that it takes is searched from
-    /// one iteration to the next. False if rounding spoils even the Hessian without negative curvature.
+    /// The Newton step, from the exact Hessian where that is positive definite. False if rounding spoils even what is taken
+    /// otherwise.
     bool newton_step() {
+        if (m_zone.nodes.empty()) return factorize_bodies() && solve_for_step(m_factor_is_exact ? 0.0 : kUnsettling);
+        return factorize_with_cloth() && solve_for_step();
+    }
+
+    /// Without the contacts' curvature where the exact Hessian is not positive definite. Next to their stiffness and to the
+    /// bodies' inertia the positive part of that curvature is nothing, and costs eigenvalues of every contact.
+    bool factorize_bodies() {
+        for (const Curvature curvature : {Curvature::full, Curvature::dropped}) {
+            differentiate(m_zone, m_w.point, curvature, m_w.derivatives, &m_w.system);
+            m_factor_is_exact = curvature == Curvature::full;
+            m_has_factor = m_w.system.factorize();
+            if (m_has_factor) return true;
+        }
+        return false;
+    }
+
+    /// Cut off no more negative curvature than needed, since it is what a sheet follows when it buckles: the share that it
+    /// takes is searched from one iteration to the next.
+    bool factorize_with_cloth() {
         bool failed = false;
         for (;;) {
             differentiate(m_zone, m_w.point, Curvature::full, m_w.derivatives, &m_w.system, m_cut);
@@ -236,20 +257,19 @@ private:
             if (m_cut == kAllCut) return false;
             failed = true;
             m_cut = m_cut == kNothingCut ? kFirstCut : std::min(kCutFactor * m_cut, kAllCut);
-            if (m_zone.nodes.empty()) m_cut = kAllCut;
         }
-        if (m_zone.nodes.empty()) {
-            m_cut = kNothingCut;
-        } else if (!failed) {
+        if (!failed) {
             m_cut /= kCutFactor;
             if (m_cut < kSmallestCut) m_cut = kNothingCut;
         }
-        return solve_for_step();
+        return true;
     }
 
-    bool solve_for_step() {
+    /// `unsettling`: share of the largest force that pushes bodies about.
+    bool solve_for_step(double unsettling = 0.0) {
         m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
         for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step.bodies[i] = -m_w.derivatives.gradient.bodies[i];
+        if (unsettling > 0.0) unsettle(unsettling * m_w.derivatives.largest_force);
         for (int i = 0; i < m_zone.node_count(); ++i) m_w.step.nodes[i] = -m_w.derivatives.gradient.nodes[i];
         m_w.system.solve_in_place(m_w.step);
         for (const Vec6& s : m_w.step.bodies)
@@ -257,6 +277,20 @@ private:
         for (const Vec3& s : m_w.step.nodes)
             if (!s.allFinite()) return false;
         return true;
+    }
+
+    /// Push every body in a direction of its own, that nothing but its index decides. Where the Hessian is indefinite the
+    /// zone may be on a saddle of its energy. Rounding leads away from it, but where bodies stand in a regular pattern it
+    /// does so at the pattern's ends only, and the others follow one by one.
+    void unsettle(double force) {
+        for (int i = 0; i < m_zone.dynamic_count; ++i) {
+            const ZoneBody& body = m_zone.bodies[i];
+            std::minstd_rand random(static_cast<std::uint32_t>(body.id) + 1);
+            random.discard(1);
+            const double scale = force * std::sqrt(body.mass);
+            for (int k = 3; k < 6; ++k)
+                m_w.step.bodies[i][k] += scale * (2.0 * static_cast<double>(random()) / std::minstd_rand::max() - 1.0);
+        }
     }
 
     double slope(const Coordinates& gradient) const {
