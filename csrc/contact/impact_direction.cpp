@@ -39,6 +39,12 @@ std::pair<int, int> objects(const ZoneContact& contact) { return {contact.a, con
 
 bool with_cloth(const ZoneContact& contact) { return contact.cloth_a >= 0 || contact.cloth_b >= 0; }
 
+/// The distance that a contact's row asks for. The row has the contact's own stiffness: bodies that it leads to where contact
+/// begins are pressed together by about as much as at the solution. Facets of cloth leave their rows, and would not touch.
+double wanted_distance(const ZoneContact& contact, bool pushes) {
+    return with_cloth(contact) && !pushes ? contact.range.landing : contact.range.rest;
+}
+
 /// Solve the QP, and again with more mass for bodies that would turn too far.
 template <class Solve>
 int solve_with_limited_turns(const Zone& zone, std::vector<double>& mass_factor, const Coordinates& p, Solve&& solve) {
@@ -132,7 +138,7 @@ ImpactDirection impact_direction(
             surface_b(zone, contact, now.poses, now.nodes), zone.ground_height);
         if (geometry.sine_sq < kParallelLimit) continue;
         const bool pushes = geometry.distance < contact.range.rest;
-        add(k, make_row(zone, contact, geometry, now, point.y, pushes ? contact.range.rest : contact.range.landing));
+        add(k, make_row(zone, contact, geometry, now, point.y, wanted_distance(contact, pushes)));
     }
 
     ImpactDirection best;
@@ -224,7 +230,7 @@ ImpactDirection impact_direction(
                 !comes_from_outside(zone, contact, geometry, impact_at.poses))
                 continue;
             add(static_cast<std::size_t>(impact.contact),
-                make_row(zone, contact, geometry, impact_at, point.y, contact.range.landing));
+                make_row(zone, contact, geometry, impact_at, point.y, wanted_distance(contact, false)));
             listed[impact.contact] = 1;
             added = true;
         }
