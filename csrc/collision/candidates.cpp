@@ -257,7 +257,9 @@ struct PlacedFeature {
 };
 
 /// Whether two features stay further apart than both meshes reach. The plane through their closest points where the
-/// motion begins, normal to their offset, is between them; they come no nearer than by what they move towards it.
+/// motion begins, normal to their offset, is between them; they come no nearer than by what they move towards it. Two
+/// meshes may be at different points of their ways: one may be stopped where the other goes on, so that what one gives
+/// way to the other does not count. Features of one mesh are on theirs together.
 class ApartTest {
 public:
     ApartTest(const SweptMesh& a, const SweptMesh& b) : m_a(a), m_b(b) {}
@@ -268,8 +270,10 @@ public:
         const double distance = offset.norm();
         if (!(distance > m_a.reach + m_b.reach)) return false;
         const Vec3 normal = offset / distance;
-        const double opening = m_feature_a.least_move(normal) + m_feature_b.least_move(-normal);
-        return distance + std::min(opening, 0.0) > m_a.reach + m_b.reach;
+        const double opening_a = m_feature_a.least_move(normal), opening_b = m_feature_b.least_move(-normal);
+        const double opening = m_a.mesh == m_b.mesh ? std::min(opening_a + opening_b, 0.0)
+                                                    : std::min(opening_a, 0.0) + std::min(opening_b, 0.0);
+        return distance + opening > m_a.reach + m_b.reach;
     }
 
 private:

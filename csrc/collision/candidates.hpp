@@ -65,7 +65,8 @@ void collect_feature_pairs(const SweptBoxes& a, const SweptBoxes& b, std::vector
 void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs);
 
 /// Remove the pairs that stay further apart than the sum of both reaches although their boxes overlap: in a mesh of
-/// triangles that is most neighbours. Costs a distance per pair. Of one mesh with itself: give it twice.
+/// triangles that is most neighbours. Each mesh may be anywhere on its way, wherever the other is. Costs a distance per
+/// pair. Of one mesh with itself, whose features move at the same time: give it twice.
 void drop_distant_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
 
 /// Whether the surfaces of two meshes go through each other where their motions begin: a side of a patch of one through a

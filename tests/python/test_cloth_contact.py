@@ -66,6 +66,25 @@ def test_falling_cloth_goes_through_nothing(onto: str, coupling: str, dt: float)
     assert contacts >= 5
 
 
+@pytest.mark.parametrize("coupling", ["monolithic", "split"])
+def test_what_falls_with_a_sheet_does_not_reach_through_it_when_it_lands(coupling: str) -> None:
+    """A slab one millimetre above a sheet, both falling alike: only where the sheet is stopped they come near."""
+    scene = ds.Scene()
+    slab = ds.shapes.box((0.6, 0.6, 0.1))
+    scene.add_body(slab, kind="static", position=(0, 0, 0.05))
+    scene.add_cloth(ds.shapes.sheet(0.5, 6), MATERIAL, position=(0.003, 0.004, 0.1012))
+    scene.add_body(slab, mass=1.0, position=(0.01, 0.02, 0.1524))
+    sim = ds.Simulator(scene, 0.01, thickness=1e-4, coupling=coupling)
+    check = CrossingCheck(scene, sim.thickness)
+    state = sim.initial_state()
+    for step in range(5):
+        state = sim(state)
+        assert check.problems(sim, state) == [], step
+        assert float(sim.min_distance(state)) > -0.9 * sim.thickness, step
+    assert sim.info is not None
+    assert sim.info.contacts >= 60  # the nodes', on either side
+
+
 @pytest.mark.parametrize("dt", [0.01, 0.02])
 @pytest.mark.parametrize("speed", [10.0, 100.0])
 @pytest.mark.parametrize("shape", ["ball", "box"])

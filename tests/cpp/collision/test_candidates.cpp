@@ -1,6 +1,7 @@
 #include "collision/candidates.hpp"
 
 #include <algorithm>
+#include <array>
 #include <set>
 #include <tuple>
 
@@ -46,11 +47,14 @@ double edge_distance(const Edge& a, const std::vector<Vec3>& xa, const Edge& b, 
     return closest_edge_edge(xa[a.p0], xa[a.p1], xb[b.p0], xb[b.p1]).distance();
 }
 
-/// All pairs of features nearer than `reach` at some sampled time, by trying all of them.
+/// All pairs of features nearer than `reach` at some sampled time of the one's motion and of the other's, by trying all of
+/// them: one may be stopped where the other goes on.
 std::set<Key> near_pairs(const SweptMesh& a, const SweptMesh& b, double reach) {
     std::set<Key> result;
-    for (const double s : {0.0, 0.3, 0.5, 0.8, 1.0}) {
-        const std::vector<Vec3> xa = vertices_at(a, s), xb = vertices_at(b, s);
+    constexpr std::array<std::array<double, 2>, 8> kTimes = {
+        {{0.0, 0.0}, {0.3, 0.3}, {0.5, 0.5}, {0.8, 0.8}, {1.0, 1.0}, {0.0, 1.0}, {1.0, 0.0}, {0.2, 0.7}}};
+    for (const auto& [time_a, time_b] : kTimes) {
+        const std::vector<Vec3> xa = vertices_at(a, time_a), xb = vertices_at(b, time_b);
         for (const int v : a.mesh->active_vertices)
             for (int p = 0; p < static_cast<int>(b.mesh->patches.size()); ++p)
                 if (vertex_patch_distance(xa[v], *b.mesh, xb, p) < reach)
