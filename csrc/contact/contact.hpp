@@ -21,6 +21,12 @@ struct Contact {
     bool with_ground() const { return object_b == kGround; }
 };
 
+/// What the multiplier of a hard contact follows from: it acts as one with this compliance and its rest distance shifted.
+struct HardContact {
+    double shift;  ///< [m]
+    double compliance;
+};
+
 /// Where the surface of an object is: at a pose, or, for cloth, at its nodes. Of a body with both, `nodes` are the vertices
 /// that are needed, placed.
 struct Surface {

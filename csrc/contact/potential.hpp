@@ -14,6 +14,10 @@ struct PotentialValue {
 /// ordinary loads, with a pole that no load gets through.
 PotentialValue contact_potential(double compression, double pole, double stiffness);
 
+/// How far the rest distance of a contact with this pole has to be shifted, its pole staying where it is, for this force to
+/// act where the rest distance was.
+double hard_contact_shift(double force, double pole, double stiffness);
+
 /// Factor on the energy of a pair of edges, a function of the squared sine c of their angle:
 /// mu = 2c/e - (c/e)² below e = kParallelLimit, 1 from there on. Between parallel edges the closest points jump;
 /// vertex-patch pairs act there.

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <random>
+#include <tuple>
 
 #include "contact/impact_gate.hpp"
 
@@ -14,18 +15,33 @@ constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
 constexpr int kMaxStalls = 3;            // steps in a row that get a driven body nowhere
 constexpr double kStall = 1e-3;          // of the way that is left
-constexpr double kHardTolerance = 1e-9;  // change of a hard contact's compression, of its range
+constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
 constexpr int kMaxHardRounds = 50;
-constexpr int kRelaxations = 8;      // Newton steps after driven bodies were stopped, before they go on
-constexpr double kRelaxed = 1e-2;    // residual at which they may go on earlier
-constexpr double kGoodEnough = 1e3;  // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;    // without halving the residual: rounding's sign
+constexpr double kSlowRound = 0.1;          // of what was left of a violation: stiffer contacts leave less
+constexpr double kStiffening = 10.0;        // of contacts, after a slow round
+constexpr double kLeastCompliance = 1e-10;  // of contacts that were stiffened
+constexpr int kRelaxations = 8;             // Newton steps after driven bodies were stopped, before they go on
+constexpr double kRelaxed = 1e-2;           // residual at which they may go on earlier
+constexpr double kGoodEnough = 1e3;         // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;           // without halving the residual: rounding's sign
 constexpr CutShare kSmallestCut = 1.0 / 256.0;
 constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
 constexpr double kCutFactor = 4.0;
 constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
 constexpr double kUnsettling = 1e-10;      // of the largest force: as little as the tolerance lets pass
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
+
+/// A hard contact and the shift of its rest distance.
+struct ShiftedContact {
+    Contact contact;
+    double shift;
+
+    bool operator<(const ShiftedContact& other) const {
+        const Contact &c = contact, &d = other.contact;
+        return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
+               std::tie(d.object_a, d.object_b, d.type, d.feature_a, d.feature_b);
+    }
+};
 
 /// State of one solve; the steps of solve_zone as members.
 class ZoneSolver {
@@ -91,6 +107,7 @@ private:
     void list_contacts(Coordinates& y_end) {
         collect_contacts(m_zone, m_passive, y(), y_end, m_coverage);
         if (m_rescue) rescue_contacts(m_zone);
+        restore_shifts();
         m_position = m_zone.model->thickness;
         if (m_zone.model->ground.present) m_position = std::max(m_position, std::abs(m_zone.ground_height));
         for (int i = 0; i < m_zone.body_count(); ++i) {
@@ -406,7 +423,7 @@ private:
         int relaxations = 0;  // Newton steps to be taken before driven bodies go on
         double best_residual = kInfinity;
         int stagnant = 0;  // steps since the residual last halved
-        for (m_result.iterations = 0;; ++m_result.iterations) {
+        for (;; ++m_result.iterations) {
             const bool driven = drives_done();
             if (!newton_step()) return fail(ZoneStatus::no_descent);
             const Accuracy now = accuracy();
@@ -537,25 +554,68 @@ private:
         return true;
     }
 
-    /// Multiplier updates [the method of multipliers]: shift each contact's rest distance by its compression, so that the
-    /// same force acts with less of it, until there is none left. Every round leaves about a compliance's part.
+    // --- hard contacts -----------------------------------------------------------------------------------------
+
+    /// Multiplier updates [the method of multipliers]: shift each contact's rest distance so that the same force acts with no
+    /// compression, until there is none left. Every round leaves 1 / (1 + k s) of it, k the stiffness and s what a force
+    /// moves the contact by: about the compliance where masses decide that. It is more under a heavy body that rests on
+    /// several light ones, and where a force on curved contacts makes s negative a round may even overshoot. There contacts
+    /// become stiffer.
     void harden() {
+        double left = kInfinity;
         for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
-            double violation = 0.0;
-            for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-                ZoneContact& contact = m_zone.contacts[k];
-                const double compression = std::max(contact.range.rest - m_w.point.distances[k], 0.0);
-                const double depth = contact.range.rest - contact.shift - contact.range.floor;
-                violation = std::max(violation, std::abs(compression - contact.shift) / depth);
-                contact.range.rest += compression - contact.shift;
-                contact.shift = compression;
-            }
+            const double violation = hard_violation();
             if (violation <= kHardTolerance) return;
             if (round >= kMaxHardRounds) return fail(ZoneStatus::too_many_iterations);
+            const bool slow = violation > kSlowRound * left && m_zone.compliance > kLeastCompliance;
+            left = violation;
+            shift_rest_distances(slow ? kStiffening : 1.0);
             evaluate(m_zone, m_w.point);
-            const int iterations = m_result.iterations;
             iterate();
-            m_result.iterations += iterations;
+        }
+    }
+
+    /// How far contacts that push are from their rest distance, of their range. Rounding is not counted.
+    double hard_violation() const {
+        double violation = 0.0;
+        for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+            const ContactRange& range = m_zone.contacts[k].range;
+            const double shift = m_zone.contacts[k].shift;
+            const double compression = std::max(range.rest - m_w.point.distances[k], 0.0);
+            const double distance = std::abs(compression - shift);
+            if (distance > 16.0 * kEpsilon * m_position)
+                violation = std::max(violation, distance / (range.rest - shift - range.floor));
+        }
+        return violation;
+    }
+    /// Let every contact's force act at its rest distance; from here on contacts are this much stiffer.
+    void shift_rest_distances(double stiffening) {
+        m_zone.compliance /= stiffening;
+        m_shifted.clear();
+        for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+            ZoneContact& contact = m_zone.contacts[k];
+            ContactRange& range = contact.range;
+            const double force =
+                contact_potential(range.rest - m_w.point.distances[k], range.rest - range.pole, contact.stiffness.value)
+                    .force;
+            contact.stiffness.value *= stiffening;
+            range.rest -= contact.shift;
+            contact.shift = hard_contact_shift(force, range.rest - range.pole, contact.stiffness.value);
+            range.rest += contact.shift;
+            if (contact.shift > 0.0) m_shifted.push_back({contact.contact, contact.shift});
+        }
+        std::sort(m_shifted.begin(), m_shifted.end());
+    }
+
+    /// Contacts that were listed anew push as before.
+    void restore_shifts() {
+        if (m_shifted.empty()) return;
+        for (ZoneContact& contact : m_zone.contacts) {
+            const ShiftedContact key{contact.contact, 0.0};
+            const auto found = std::lower_bound(m_shifted.begin(), m_shifted.end(), key);
+            if (found == m_shifted.end() || key < *found) continue;
+            contact.shift = found->shift;
+            contact.range.rest += found->shift;
         }
     }
 
@@ -568,6 +628,7 @@ private:
     std::vector<Box>& m_visited;
     ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
+    std::vector<ShiftedContact> m_shifted;   // hard contacts that push, sorted
     double m_position = 0.0;                 // size of the numbers that distances are differences of [m]
     CutShare m_cut = kNothingCut;            // of the next Newton step
     bool m_has_factor = false;               // the system, of the Hessian of the last Newton step

@@ -88,10 +88,11 @@ void RecordedZones::list_contacts(
     };
     for (int c = first.contact; c < end.contact; ++c) {
         const Contact& contact = m_record.zones.contacts[c];
+        if (zone.hard) zone.compliance = m_record.zones.hard[c].compliance;
         add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
         ZoneContact& entry = zone.contacts.back();
         if (zone.hard) {
-            entry.shift = m_record.zones.shifts[c];
+            entry.shift = m_record.zones.hard[c].shift;
             entry.range.rest += entry.shift;
         }
         if (zone.yields(entry.a) && zone.yields(entry.b))

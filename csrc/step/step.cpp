@@ -59,7 +59,7 @@ struct BlockedDrive {
 /// What one thread collects of the groups it solves.
 struct alignas(64) GroupResults {   // of cache lines of its own
     std::vector<Contact> contacts;  ///< active, group after group
-    std::vector<double> shifts;     ///< of their rest distances
+    std::vector<HardContact> hard;  ///< of theirs, if they are
     std::vector<BlockedDrive> blocked;
     std::vector<int> near;
 };
@@ -228,7 +228,7 @@ private:
         m.dirty.assign(count, 1);
         for (GroupResults& results : m.results) {
             results.contacts.clear();
-            results.shifts.clear();
+            results.hard.clear();
             results.blocked.clear();
         }
         m.groups.start(object_count(), m.movers);
@@ -345,7 +345,7 @@ private:
             const ZoneContact& contact = zone.contacts[active.index];
             const Contact& c = contact.contact;
             results.contacts.push_back(c);
-            results.shifts.push_back(contact.shift);
+            results.hard.push_back({contact.shift, zone.compliance});
             outcome.max_compression =
                 std::max(outcome.max_compression, contact.range.rest - contact.shift - active.geometry.distance);
             std::uint64_t& hash = outcome.signature;
@@ -397,7 +397,7 @@ private:
             const GroupResults& results = m.results[outcome.thread];
             const int first = outcome.first_contact;
             m.contact_lists.push_back(
-                {results.contacts.data() + first, results.shifts.data() + first, outcome.contact_end - first});
+                {results.contacts.data() + first, results.hard.data() + first, outcome.contact_end - first});
         }
         m.zone_finder.find(
             m_model, m.movers, m.contact_lists, m_options.compliance == 0.0, m_options.global_zone, m.zones);

@@ -38,6 +38,63 @@ def test_compliance_tends_to_hard_contact() -> None:
     assert errors[2] < 0.05 * errors[0]
 
 
+def stack(*masses: float) -> ds.Scene:
+    """Boxes upon each other, the first on the ground."""
+    scene = ds.Scene()
+    scene.add_ground()
+    for k, mass in enumerate(masses):
+        position = (0.01 * (k % 2), 0.013 * (k % 3), (k + 0.5) * 0.501)
+        scene.add_body(ds.shapes.box(0.5), mass=mass, position=position)
+    return scene
+
+
+def test_a_heavy_body_rests_on_light_ones() -> None:
+    """The contacts between the light ones are as stiff as their own masses make them, and are stiffened."""
+    sim = ds.Simulator(stack(1.0, 1.0, 1e4), dt=0.01, compliance=0.0, on_failure="raise")
+    state = sim.initial_state()
+    sim.rollout(state, None, steps=60)
+    assert sim.info is not None
+    assert sim.info.contacts == 12
+    assert sim.info.max_compression < HARD_COMPRESSION * sim.thickness
+
+
+def draped(lower: float, upper: float) -> ds.Scene:
+    """A sheet over a box, and a tilted one that falls on it."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(ds.shapes.box(0.3), mass=lower, position=(0, 0, 0.15))
+    material = ds.ClothMaterial(density=0.2 / 0.36, stretch=1e3, shear=300.0, bend=1e-4)
+    scene.add_cloth(ds.shapes.sheet(0.6, 9), material, position=(0.003, 0.004, 0.302))
+    scene.add_body(ds.shapes.box(0.25), mass=upper, position=(0.02, 0.01, 0.48), orientation=(1, 0.1, 0.05, 0.2))
+    return scene
+
+
+@pytest.mark.parametrize("masses", [(10.0, 10.0), (1000.0, 1000.0)])
+def test_cloth_between_heavy_bodies_converges(masses: tuple[float, float]) -> None:
+    """Contacts that a round lists anew go on from their multipliers, not from none."""
+    sim = ds.Simulator(draped(*masses), dt=0.01, compliance=0.0, on_failure="raise")
+    state = sim.initial_state()
+    contacts = 0
+    for _ in range(25):
+        state = sim(state)
+        assert sim.info is not None
+        assert sim.info.max_compression < HARD_COMPRESSION * sim.thickness
+        contacts = max(contacts, sim.info.contacts)
+    assert contacts >= 90
+
+
+def test_gradient_under_heavy_bodies_equals_central_differences() -> None:
+    """The larger the ratio of masses the more of a difference is noise, and the larger eps has to be."""
+    for scene, steps, eps in ((stack(1.0, 1.0, 1e4), 15, 1e-4), (draped(1000.0, 1000.0), 5, 1e-6)):
+        sim = ds.Simulator(scene, dt=0.01, compliance=0.0)
+        state = sim.rollout(sim.initial_state(), None, steps)[-1]
+        report = ds.diagnostics.gradcheck(sim, state, steps=1, directions=2, eps=eps)
+        assert sim.info is not None
+        assert sim.info.converged and sim.info.contacts >= 12
+        assert len(report.stable) == len(report.directions)
+        assert report.passed, str(report)
+
+
 @pytest.mark.parametrize("scene", [scenes.tilted_box, scenes.box_on_box])
 def test_gradient_equals_central_differences(scene) -> None:  # type: ignore[no-untyped-def]
     sim = ds.Simulator(scene(), dt=0.01, compliance=0.0)

@@ -47,6 +47,16 @@ TEST(potential_starts_smoothly_and_ends_in_a_pole) {
     CHECK(contact_potential(0.999999e-3, 1e-3, 1e4).force > 1e9 * start.force);
 }
 
+TEST(a_hard_contact_has_its_force_at_its_rest_distance) {
+    constexpr double kPole = 2e-3, kStiffness = 3e4;
+    CHECK(hard_contact_shift(0.0, kPole, kStiffness) == 0.0);
+    for (const double force : {1e-9, 1e-3, 1.0, kStiffness * kPole, 1e6, 1e15}) {
+        NOTE(force);
+        const double shift = hard_contact_shift(force, kPole, kStiffness);
+        CHECK_NEAR(contact_potential(shift, kPole + shift, kStiffness).force, force, 1e-11 * force);
+    }
+}
+
 TEST(mollifier_agrees_with_differences_and_joins_smoothly) {
     for (const double part : {0.0, 0.1, 0.5, 0.9}) {
         NOTE(part);
