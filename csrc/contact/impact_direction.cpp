@@ -12,7 +12,8 @@ namespace {
 constexpr int kMaxRounds = 40;
 constexpr double kMaxTurn = 0.5;  // [rad] in one direction: rows hold their meaning over that
 constexpr int kMaxTurnLimits = 5;
-constexpr double kNearby = 2.0;        // pairs this many contact ranges away are rows from the start
+constexpr std::size_t kRowsPerCoordinate = 4;  // more do not lead further: the sheet would have to go another way
+constexpr double kNearby = 2.0;                // pairs this many contact ranges away are rows from the start
 constexpr double kImpactWindow = 0.5;  // later impacts of two bodies count up to this part of the smaller radius
 
 /// Between closed surfaces a first impact comes from outside: normals that point into a body belong to pairs hit after
@@ -111,6 +112,7 @@ Coordinates difference(const Coordinates& a, const Coordinates& b) {
 ImpactDirection impact_direction(
     const Zone& zone, const ZonePoint& point, BlockSystem& system, const ImpactDirection* before) {
     const int count = zone.dynamic_count;
+    const std::size_t coordinate_count = 6 * static_cast<std::size_t>(count) + 3 * zone.nodes.size();
     Coordinates gradient;
     gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     for (int i = 0; i < count; ++i)
@@ -175,7 +177,7 @@ ImpactDirection impact_direction(
             best.step = step;
             best.y_end = y_end;
         }
-        if (impacts.empty()) break;
+        if (impacts.empty() || (cloth != nullptr && rows.size() > kRowsPerCoordinate * coordinate_count)) break;
 
         std::vector<std::pair<std::pair<int, int>, double>> first;  // first impact of each pair of bodies
         for (const Impact& impact : impacts) {

@@ -24,6 +24,9 @@ constexpr int kRelaxations = 8;             // Newton steps after driven bodies 
 constexpr double kRelaxed = 1e-2;           // residual at which they may go on earlier
 constexpr double kGoodEnough = 1e3;         // times the tolerance: enough where rounding hides all further descent
 constexpr int kStagnantSteps = 6;           // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;            // without a lower energy: there is none to be found
+constexpr int kMaxQpSteps = 6000;           // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
+constexpr int kStepsWithoutQp = 200;        // so many steps
 constexpr CutShare kSmallestCut = 1.0 / 256.0;
 constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
 constexpr double kCutFactor = 4.0;
@@ -423,6 +426,9 @@ private:
         int relaxations = 0;  // Newton steps to be taken before driven bodies go on
         double best_residual = kInfinity;
         int stagnant = 0;  // steps since the residual last halved
+        int steps_without_qp = 0;
+        double lowest_energy = kInfinity;
+        int futile = 0;  // steps since it fell by more than rounding may do
         for (;; ++m_result.iterations) {
             const bool driven = drives_done();
             if (!newton_step()) return fail(ZoneStatus::no_descent);
@@ -438,7 +444,14 @@ private:
             stagnant = now.residual < 0.5 * best_residual ? 0 : stagnant + 1;
             best_residual = std::min(best_residual, now.residual);
             if (driven && stagnant >= kStagnantSteps && now.residual < good) return;
-            if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
+            const bool lower = m_w.point.energy < lowest_energy - energy_noise();
+            futile = driven && !lower ? futile + 1 : 0;
+            if (lower || !driven) lowest_energy = m_w.point.energy;
+            if (futile >= kFutileSteps) return fail(ZoneStatus::no_descent);
+            const bool without_qp = !m_zone.nodes.empty() && m_qp_steps >= kMaxQpSteps;
+            steps_without_qp += without_qp ? 1 : 0;
+            if (m_result.iterations >= m_options.max_iterations || steps_without_qp > kStepsWithoutQp)
+                return fail(ZoneStatus::too_many_iterations);
 
             if (!driven && relaxations == 0) {
                 const double step = past_impacts(0.0, false);
@@ -453,7 +466,7 @@ private:
             // here, so energy and derivatives stand.
             ensure_covered(m_w.y_end);
             double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
-            if (driven && step < kClampedStep)
+            if (driven && step < kClampedStep && !without_qp)
                 step = past_impacts(step, true);
             else if (step < 1.0 || !gates_hold(m_gates, m_zone, m_w.y_end))
                 step = arc_step(step);
@@ -497,10 +510,12 @@ private:
         set_to_targets(target);
         ensure_covered(target);
         ImpactDirection direction = impact_direction(m_zone, m_w.point, m_w.system);
+        m_qp_steps += direction.newton_steps;
         for (int k = 0; k < 8 && !is_covered(m_zone, m_coverage, direction.y_end); ++k) {
             list_contacts(direction.y_end);
             evaluate(m_zone, m_w.point);
             direction = impact_direction(m_zone, m_w.point, m_w.system, &direction);
+            m_qp_steps += direction.newton_steps;
         }
         const Coordinates newton_end = m_w.y_end;
         m_w.y_end = direction.y_end;
@@ -630,6 +645,7 @@ private:
     std::vector<ImpactGate> m_gates;
     std::vector<ShiftedContact> m_shifted;   // hard contacts that push, sorted
     double m_position = 0.0;                 // size of the numbers that distances are differences of [m]
+    int m_qp_steps = 0;                      // Newton steps of impact QPs so far
     CutShare m_cut = kNothingCut;            // of the next Newton step
     bool m_has_factor = false;               // the system, of the Hessian of the last Newton step
     bool m_factor_is_exact = false;          // without anything cut off

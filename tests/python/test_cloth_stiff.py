@@ -5,6 +5,7 @@ Run as a script it prints the table of iteration counts in docs/cloth.md.
 
 from __future__ import annotations
 
+import time
 import warnings
 from dataclasses import dataclass
 from functools import cache
@@ -21,6 +22,7 @@ STARTS = ("tripled", "crumpled", "needles")
 STEPS, WINDOW = 12, 10
 # Of the energy at the start: the solver's 1e-10 of a force.
 ROUNDING = 1e-9
+LONG = 60.0  # [s], of two steps of a small sheet; without bounds on their work they take many minutes
 
 
 def start(kind: str, n: int = 6) -> tuple[Any, Any, Any]:
@@ -117,6 +119,23 @@ def test_converges_where_nothing_but_elasticity_acts() -> None:
         state = sim(state)
         assert sim.info is not None
         assert sim.info.iterations <= 20
+
+
+@pytest.mark.filterwarnings("ignore::diffsim.ConvergenceWarning")
+@pytest.mark.parametrize("stretch", [1e-3, 1e3])
+def test_absurd_bending_under_a_heavy_ball_ends(stretch: float) -> None:
+    """Sheets that would rather do anything than bend: a step may fail, but says so in time."""
+    scene = ds.Scene()
+    material = ds.ClothMaterial(density=0.2, stretch=stretch, shear=0.3 * stretch, bend=1e3)
+    scene.add_cloth(ds.shapes.sheet(0.5, 8), material, pinned=[0, 7, 56, 63])
+    scene.add_sphere(0.1, mass=100.0, position=(0.01, 0.02, 0.12), velocity=(0, 0, -20))
+    sim = ds.Simulator(scene, 0.01)
+    state = sim.initial_state()
+    begin = time.process_time()
+    for _ in range(2):
+        state = sim(state)
+        assert bool(state.node_position.isfinite().all() and state.position.isfinite().all())
+    assert time.process_time() - begin < LONG
 
 
 def print_table() -> None:
