@@ -146,7 +146,8 @@ def gradcheck(
         median_tolerance: The largest median error with which `GradcheckReport.passed`.
         max_tolerance: The largest error with which it does.
     Returns: The report, one entry per direction.
-    Raises: ValueError, TypeError as `Simulator.rollout`, and for a name in `wrt` that there is nothing of.
+    Raises: ValueError, TypeError as `Simulator.rollout`, and for a name in `wrt` that there is nothing of; ValueError
+        if eps is so large that bodies moved by it penetrate.
     """
     where = "gradcheck"
     check_instance(where, "sim", sim, Simulator, "be a diffsim.Simulator")
@@ -188,7 +189,12 @@ def gradcheck(
         for name, grad in zip(names, grads):
             for _ in range(directions):
                 step = eps * _direction(name, inputs, sim, generator)
-                sides = [run({**inputs, name: inputs[name] + sign * step}) for sign in (1.0, -1.0)]
+                try:
+                    sides = [run({**inputs, name: inputs[name] + sign * step}) for sign in (1.0, -1.0)]
+                except ValueError as refusal:
+                    raise ValueError(
+                        f"{where}: with {name} moved by eps = {eps:g}: {refusal}; take a smaller eps"
+                    ) from None
                 changed = any(bool((signature != base_signature).any()) for _, signature in sides)
                 difference = float(sides[0][0] - sides[1][0]) / (2 * eps)
                 rows.append((name, float((grad * step).sum()) / eps, difference, changed))

@@ -138,3 +138,13 @@ def test_wrong_arguments_are_named(sim: ds.Simulator) -> None:
         gradcheck(sim, state, eps=0.0)
     with pytest.raises(TypeError, match=r"gradcheck: sim must be a diffsim.Simulator, got str"):
         gradcheck("sim", state)  # type: ignore[arg-type]
+
+
+def test_an_eps_that_makes_bodies_penetrate_is_refused() -> None:
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(ds.shapes.box(0.2), density=1000.0, position=(0, 0, 0.1003), name="crate")
+    sim = ds.Simulator(scene, dt=0.01)
+    message = "gradcheck: with position moved by eps = 0.01: .* 'crate' and 'ground' penetrate.*; take a smaller eps"
+    with pytest.raises(ValueError, match=message):
+        gradcheck(sim, sim.initial_state(), wrt=["position"], eps=0.01)
