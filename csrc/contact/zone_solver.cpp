@@ -2,11 +2,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdint>
-#include <random>
-#include <tuple>
 
+#include "contact/hard_contacts.hpp"
 #include "contact/impact_gate.hpp"
+#include "contact/newton_direction.hpp"
+#include "contact/zone_accuracy.hpp"
 
 namespace diffsim {
 namespace {
@@ -17,34 +17,15 @@ constexpr int kMaxStalls = 3;            // steps in a row that get a driven bod
 constexpr double kStall = 1e-3;          // of the way that is left
 constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
 constexpr int kMaxHardRounds = 50;
-constexpr double kSlowRound = 0.1;          // of what was left of a violation: stiffer contacts leave less
-constexpr double kStiffening = 10.0;        // of contacts, after a slow round
-constexpr double kLeastCompliance = 1e-10;  // of contacts that were stiffened
-constexpr int kRelaxations = 8;             // Newton steps after driven bodies were stopped, before they go on
-constexpr double kRelaxed = 1e-2;           // residual at which they may go on earlier
-constexpr double kGoodEnough = 1e3;         // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;           // without halving the residual: rounding's sign
-constexpr int kFutileSteps = 50;            // without a lower energy: there is none to be found
-constexpr int kMaxQpSteps = 6000;           // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
-constexpr int kStepsWithoutQp = 200;        // so many steps
-constexpr CutShare kSmallestCut = 1.0 / 256.0;
-constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
-constexpr double kCutFactor = 4.0;
+constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
+constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
+constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;           // without a lower energy: there is none to be found
+constexpr int kMaxQpSteps = 6000;          // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
+constexpr int kStepsWithoutQp = 200;       // so many steps
 constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
-constexpr double kUnsettling = 1e-10;      // of the largest force: as little as the tolerance lets pass
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
-
-/// A hard contact and the shift of its rest distance.
-struct ShiftedContact {
-    Contact contact;
-    double shift;
-
-    bool operator<(const ShiftedContact& other) const {
-        const Contact &c = contact, &d = other.contact;
-        return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
-               std::tie(d.object_a, d.object_b, d.type, d.feature_a, d.feature_b);
-    }
-};
 
 /// State of one solve; the steps of solve_zone as members.
 class ZoneSolver {
@@ -110,7 +91,7 @@ private:
     void list_contacts(Coordinates& y_end) {
         collect_contacts(m_zone, m_passive, y(), y_end, m_coverage);
         if (m_rescue) rescue_contacts(m_zone);
-        restore_shifts();
+        m_hard.restore(m_zone);
         m_position = m_zone.model->thickness;
         if (m_zone.model->ground.present) m_position = std::max(m_position, std::abs(m_zone.ground_height));
         for (int i = 0; i < m_zone.body_count(); ++i) {
@@ -216,102 +197,8 @@ private:
 
     // --- Newton ------------------------------------------------------------------------------------------------
 
-    struct Accuracy {
-        double residual;  ///< relative
-        double floor;     ///< what rounding leaves of it
-    };
-
-    Accuracy accuracy() const {
-        double residual = 0.0, reference = m_w.derivatives.largest_force;
-        for (int i = 0; i < m_zone.dynamic_count; ++i) {
-            const ZoneBody& body = m_zone.bodies[i];
-            const Vec6& g = m_w.derivatives.gradient.bodies[i];
-            residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
-            reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
-        }
-        for (int i = 0; i < m_zone.node_count(); ++i) {
-            const ZoneNode& node = m_zone.nodes[i];
-            if (node.pinned) continue;
-            const double root_mass = std::sqrt(node.mass);
-            residual = std::max(residual, m_w.derivatives.gradient.nodes[i].norm() / root_mass);
-            reference = std::max(reference, (node.warm - node.target).norm() * root_mass);
-        }
-        // Nothing pushes here and nothing did before: only the exact answer will do, or a step lost in rounding.
-        if (!(reference > 0.0)) return {residual > 0.0 ? 1.0 : 0.0, 0.0};
-        return {residual / reference, kEpsilon * m_position * m_w.derivatives.largest_stiffness / reference};
-    }
-
-    static double scaled(const Mat3& turn_metric, double shift_metric, const Vec6& v) {
-        const Vec3 turn = v.head<3>();
-        return std::sqrt(turn.dot(turn_metric * turn) + shift_metric * v.tail<3>().squaredNorm());
-    }
-
-    /// The Newton step, from the exact Hessian where that is positive definite. False if rounding spoils even what is taken
-    /// otherwise.
-    bool newton_step() {
-        if (m_zone.nodes.empty()) return factorize_bodies() && solve_for_step(m_factor_is_exact ? 0.0 : kUnsettling);
-        return factorize_with_cloth() && solve_for_step();
-    }
-
-    /// Without the contacts' curvature where the exact Hessian is not positive definite. Next to their stiffness and to the
-    /// bodies' inertia the positive part of that curvature is nothing, and costs eigenvalues of every contact.
-    bool factorize_bodies() {
-        for (const Curvature curvature : {Curvature::full, Curvature::dropped}) {
-            differentiate(m_zone, m_w.point, curvature, m_w.derivatives, &m_w.system);
-            m_factor_is_exact = curvature == Curvature::full;
-            m_has_factor = m_w.system.factorize();
-            if (m_has_factor) return true;
-        }
-        return false;
-    }
-
-    /// Cut off no more negative curvature than needed, since it is what a sheet follows when it buckles: the share that it
-    /// takes is searched from one iteration to the next.
-    bool factorize_with_cloth() {
-        bool failed = false;
-        for (;;) {
-            differentiate(m_zone, m_w.point, Curvature::full, m_w.derivatives, &m_w.system, m_cut);
-            m_factor_is_exact = m_cut == kNothingCut;
-            m_has_factor = m_w.system.factorize();
-            if (m_has_factor) break;
-            if (m_cut == kAllCut) return false;
-            failed = true;
-            m_cut = m_cut == kNothingCut ? kFirstCut : std::min(kCutFactor * m_cut, kAllCut);
-        }
-        if (!failed) {
-            m_cut /= kCutFactor;
-            if (m_cut < kSmallestCut) m_cut = kNothingCut;
-        }
-        return true;
-    }
-
-    /// `unsettling`: share of the largest force that pushes bodies about.
-    bool solve_for_step(double unsettling = 0.0) {
-        m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step.bodies[i] = -m_w.derivatives.gradient.bodies[i];
-        if (unsettling > 0.0) unsettle(unsettling * m_w.derivatives.largest_force);
-        for (int i = 0; i < m_zone.node_count(); ++i) m_w.step.nodes[i] = -m_w.derivatives.gradient.nodes[i];
-        m_w.system.solve_in_place(m_w.step);
-        for (const Vec6& s : m_w.step.bodies)
-            if (!s.allFinite()) return false;
-        for (const Vec3& s : m_w.step.nodes)
-            if (!s.allFinite()) return false;
-        return true;
-    }
-
-    /// Push every body in a direction of its own, that nothing but its index decides. Where the Hessian is indefinite the
-    /// zone may be on a saddle of its energy. Rounding leads away from it, but where bodies stand in a regular pattern it
-    /// does so at the pattern's ends only, and the others follow one by one.
-    void unsettle(double force) {
-        for (int i = 0; i < m_zone.dynamic_count; ++i) {
-            const ZoneBody& body = m_zone.bodies[i];
-            std::minstd_rand random(static_cast<std::uint32_t>(body.id) + 1);
-            random.discard(1);
-            const double scale = force * std::sqrt(body.mass);
-            for (int k = 3; k < 6; ++k)
-                m_w.step.bodies[i][k] += scale * (2.0 * static_cast<double>(random()) / std::minstd_rand::max() - 1.0);
-        }
-    }
+    Accuracy current_accuracy() const { return accuracy(m_zone, m_w.derivatives, m_position); }
+    double current_noise() { return energy_noise(m_zone, m_w.point, m_w.system, m_position, m_w.pushed); }
 
     double slope(const Coordinates& gradient) const {
         double sum = 0.0;
@@ -333,38 +220,12 @@ private:
         return largest;
     }
 
-    /// What rounding can do to the energy. The errors of one body's contacts may all add up. Those of different bodies are
-    /// independent: their sum grows with the root of their number.
-    double energy_noise() {
-        double force_sum = 0.0;
-        m_w.pushed.assign(static_cast<std::size_t>(m_zone.dynamic_count), 0.0);
-        for (const ActiveContact& active : m_w.point.active) {
-            const ZoneContact& contact = m_zone.contacts[active.index];
-            const double pole = contact.range.rest - contact.range.pole;
-            const double force =
-                contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
-            const bool yields_a = m_zone.yields(contact.a), yields_b = m_zone.yields(contact.b);
-            if (yields_a) m_w.pushed[contact.a] += force;
-            if (yields_b) m_w.pushed[contact.b] += force;
-            if (!yields_a && !yields_b) force_sum += force;
-        }
-        double square_sum = 0.0;
-        for (double force : m_w.pushed) square_sum += force * force;
-        force_sum += std::sqrt(square_sum);
-        // The elements' forces |f| = sqrt(2 k E), by Cauchy-Schwarz Σ |f| <= sqrt(2 Σk ΣE).
-        double stiffness_sum = 0.0;
-        for (int i = 0; i < m_zone.node_count(); ++i)
-            if (!m_zone.nodes[i].pinned) stiffness_sum += m_w.system.node_diagonal(i).trace();
-        force_sum += std::sqrt(2.0 * stiffness_sum * m_w.point.elastic_energy);
-        return 1e-15 * std::abs(m_w.point.energy) + 8.0 * kEpsilon * m_position * force_sum;
-    }
-
     /// Backtrack along the way to y_end until the energy falls. At rest its fall drowns in rounding: there the slope
     /// tells. False if no step does.
     bool line_search(double first_step) {
         m_trial_is_differentiated = false;
         const double slope0 = slope(m_w.derivatives.gradient);
-        const double noise = energy_noise();
+        const double noise = current_noise();
         double step = first_step;
         for (int k = 0; k < kMaxHalvings && step > 0.0; ++k, step *= 0.5) {
             if (step == 1.0)
@@ -392,7 +253,7 @@ private:
     /// same. The gradient is worth its price where factors are dear, with cloth, and where the line search has it anyway.
     bool finish_with_this_factor() {
         const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
-        if (!m_has_factor || !(with_cloth || (m_factor_is_exact && m_trial_is_differentiated))) return false;
+        if (!m_newton.has_factor() || !(with_cloth || (m_newton.is_exact() && m_trial_is_differentiated))) return false;
         const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
         for (double before = m_result.residual;;) {
             if (m_trial_is_differentiated)
@@ -401,10 +262,10 @@ private:
                 differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
             m_trial_is_differentiated = false;
             m_w.derivatives.largest_stiffness = stiffness;
-            const Accuracy now = accuracy();
+            const Accuracy now = current_accuracy();
             const bool done = now.residual < std::max(m_options.tolerance, now.floor);
             if (!done && !(with_cloth && now.residual < kContraction * before)) return false;
-            if (!solve_for_step()) return false;
+            if (!m_newton.repeat(m_zone, m_w.derivatives, m_w.system, m_w.step)) return false;
             set_step_end();
             m_result.residual = before = now.residual;
             const bool moved = polish();
@@ -431,8 +292,9 @@ private:
         int futile = 0;  // steps since it fell by more than rounding may do
         for (;; ++m_result.iterations) {
             const bool driven = drives_done();
-            if (!newton_step()) return fail(ZoneStatus::no_descent);
-            const Accuracy now = accuracy();
+            if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
+                return fail(ZoneStatus::no_descent);
+            const Accuracy now = current_accuracy();
             m_result.residual = now.residual;
             set_step_end();
             const double rounding_step = 16.0 * kEpsilon * m_position;
@@ -444,7 +306,7 @@ private:
             stagnant = now.residual < 0.5 * best_residual ? 0 : stagnant + 1;
             best_residual = std::min(best_residual, now.residual);
             if (driven && stagnant >= kStagnantSteps && now.residual < good) return;
-            const bool lower = m_w.point.energy < lowest_energy - energy_noise();
+            const bool lower = m_w.point.energy < lowest_energy - current_noise();
             futile = driven && !lower ? futile + 1 : 0;
             if (lower || !driven) lowest_energy = m_w.point.energy;
             if (futile >= kFutileSteps) return fail(ZoneStatus::no_descent);
@@ -492,7 +354,8 @@ private:
             if (m_zone.nodes[i].pinned) y().nodes[i] = m_zone.nodes[i].target;
         evaluate(m_zone, m_w.point);
         for (m_result.iterations = 0; m_result.iterations < count; ++m_result.iterations) {
-            if (!newton_step()) return fail(ZoneStatus::no_descent);
+            if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
+                return fail(ZoneStatus::no_descent);
             m_w.trial.y = y();
             for (int i = 0; i < m_zone.node_count(); ++i) m_w.trial.y.nodes[i] += m_w.step.nodes[i];
             evaluate(m_zone, m_w.trial);
@@ -500,12 +363,12 @@ private:
             std::swap(m_w.point, m_w.trial);
         }
         differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
-        m_result.residual = accuracy().residual;
+        m_result.residual = current_accuracy().residual;
     }
 
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
     double past_impacts(double newton_limit, bool driven) {
-        m_has_factor = false;  // the QP factorizes its own matrix
+        m_newton.lose_factor();  // the QP factorizes its own matrix
         Coordinates target = y();
         set_to_targets(target);
         ensure_covered(target);
@@ -564,73 +427,20 @@ private:
         if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial);
-        if (!(m_w.trial.energy <= m_w.point.energy + energy_noise())) return false;
+        if (!(m_w.trial.energy <= m_w.point.energy + current_noise())) return false;
         accept_trial();
         return true;
     }
 
-    // --- hard contacts -----------------------------------------------------------------------------------------
-
-    /// Multiplier updates [the method of multipliers]: shift each contact's rest distance so that the same force acts with no
-    /// compression, until there is none left. Every round leaves 1 / (1 + k s) of it, k the stiffness and s what a force
-    /// moves the contact by: about the compliance where masses decide that. It is more under a heavy body that rests on
-    /// several light ones, and where a force on curved contacts makes s negative a round may even overshoot. There contacts
-    /// become stiffer.
+    /// Rounds of multipliers until hard contacts are at their rest distance.
     void harden() {
-        double left = kInfinity;
         for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
-            const double violation = hard_violation();
+            const double violation = HardContacts::violation(m_zone, m_w.point, m_position);
             if (violation <= kHardTolerance) return;
             if (round >= kMaxHardRounds) return fail(ZoneStatus::too_many_iterations);
-            const bool slow = violation > kSlowRound * left && m_zone.compliance > kLeastCompliance;
-            left = violation;
-            shift_rest_distances(slow ? kStiffening : 1.0);
+            m_hard.shift(m_zone, m_w.point, violation);
             evaluate(m_zone, m_w.point);
             iterate();
-        }
-    }
-
-    /// How far contacts that push are from their rest distance, of their range. Rounding is not counted.
-    double hard_violation() const {
-        double violation = 0.0;
-        for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-            const ContactRange& range = m_zone.contacts[k].range;
-            const double shift = m_zone.contacts[k].shift;
-            const double compression = std::max(range.rest - m_w.point.distances[k], 0.0);
-            const double distance = std::abs(compression - shift);
-            if (distance > 16.0 * kEpsilon * m_position)
-                violation = std::max(violation, distance / (range.rest - shift - range.floor));
-        }
-        return violation;
-    }
-    /// Let every contact's force act at its rest distance; from here on contacts are this much stiffer.
-    void shift_rest_distances(double stiffening) {
-        m_zone.compliance /= stiffening;
-        m_shifted.clear();
-        for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-            ZoneContact& contact = m_zone.contacts[k];
-            ContactRange& range = contact.range;
-            const double force =
-                contact_potential(range.rest - m_w.point.distances[k], range.rest - range.pole, contact.stiffness.value)
-                    .force;
-            contact.stiffness.value *= stiffening;
-            range.rest -= contact.shift;
-            contact.shift = hard_contact_shift(force, range.rest - range.pole, contact.stiffness.value);
-            range.rest += contact.shift;
-            if (contact.shift > 0.0) m_shifted.push_back({contact.contact, contact.shift});
-        }
-        std::sort(m_shifted.begin(), m_shifted.end());
-    }
-
-    /// Contacts that were listed anew push as before.
-    void restore_shifts() {
-        if (m_shifted.empty()) return;
-        for (ZoneContact& contact : m_zone.contacts) {
-            const ShiftedContact key{contact.contact, 0.0};
-            const auto found = std::lower_bound(m_shifted.begin(), m_shifted.end(), key);
-            if (found == m_shifted.end() || key < *found) continue;
-            contact.shift = found->shift;
-            contact.range.rest += found->shift;
         }
     }
 
@@ -643,12 +453,10 @@ private:
     std::vector<Box>& m_visited;
     ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
-    std::vector<ShiftedContact> m_shifted;   // hard contacts that push, sorted
-    double m_position = 0.0;                 // size of the numbers that distances are differences of [m]
-    int m_qp_steps = 0;                      // Newton steps of impact QPs so far
-    CutShare m_cut = kNothingCut;            // of the next Newton step
-    bool m_has_factor = false;               // the system, of the Hessian of the last Newton step
-    bool m_factor_is_exact = false;          // without anything cut off
+    HardContacts m_hard;
+    double m_position = 0.0;  // size of the numbers that distances are differences of [m]
+    int m_qp_steps = 0;       // Newton steps of impact QPs so far
+    NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
     bool m_rescue = false;                   // some objects start the step below their floor
     ZoneResult m_result;

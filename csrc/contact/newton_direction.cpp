@@ -1,0 +1,98 @@
+#include "contact/newton_direction.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <random>
+
+namespace diffsim {
+namespace {
+
+constexpr CutShare kSmallestCut = 1.0 / 256.0;
+constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
+constexpr double kCutFactor = 4.0;
+constexpr double kUnsettling = 1e-10;  // of the largest force: as little as the tolerance lets pass
+
+void set_to_descent(const Zone& zone, const ZoneDerivatives& derivatives, Coordinates& step) {
+    step.resize(static_cast<std::size_t>(zone.dynamic_count), zone.nodes.size());
+    for (int i = 0; i < zone.dynamic_count; ++i) step.bodies[i] = -derivatives.gradient.bodies[i];
+    for (int i = 0; i < zone.node_count(); ++i) step.nodes[i] = -derivatives.gradient.nodes[i];
+}
+
+bool solve(const BlockSystem& system, Coordinates& step) {
+    system.solve_in_place(step);
+    for (const Vec6& s : step.bodies)
+        if (!s.allFinite()) return false;
+    for (const Vec3& s : step.nodes)
+        if (!s.allFinite()) return false;
+    return true;
+}
+
+/// Push every body in a direction of its own, that nothing but its id decides. Where the Hessian is indefinite the
+/// zone may be on a saddle of its energy. Rounding leads away from it, but where bodies stand in a regular pattern it
+/// does so at the pattern's ends only, and the others follow one by one.
+void unsettle(const Zone& zone, double force, Coordinates& step) {
+    for (int i = 0; i < zone.dynamic_count; ++i) {
+        const ZoneBody& body = zone.bodies[i];
+        std::minstd_rand random(static_cast<std::uint32_t>(body.id) + 1);
+        random.discard(1);
+        const double scale = force * std::sqrt(body.mass);
+        for (int k = 3; k < 6; ++k)
+            step.bodies[i][k] += scale * (2.0 * static_cast<double>(random()) / std::minstd_rand::max() - 1.0);
+    }
+}
+
+}  // namespace
+
+bool NewtonDirection::compute(
+    const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system, Coordinates& step) {
+    const bool bodies_alone = zone.nodes.empty();
+    if (!(bodies_alone ? factorize_bodies(zone, point, derivatives, system)
+                       : factorize_with_cloth(zone, point, derivatives, system)))
+        return false;
+    set_to_descent(zone, derivatives, step);
+    if (bodies_alone && !m_is_exact) unsettle(zone, kUnsettling * derivatives.largest_force, step);
+    return solve(system, step);
+}
+
+bool NewtonDirection::repeat(
+    const Zone& zone, const ZoneDerivatives& derivatives, const BlockSystem& system, Coordinates& step) const {
+    set_to_descent(zone, derivatives, step);
+    return solve(system, step);
+}
+
+/// Without the contacts' curvature where the exact Hessian is not positive definite. Next to their stiffness and to the
+/// bodies' inertia the positive part of that curvature is nothing, and costs eigenvalues of every contact.
+bool NewtonDirection::factorize_bodies(
+    const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system) {
+    for (const Curvature curvature : {Curvature::full, Curvature::dropped}) {
+        differentiate(zone, point, curvature, derivatives, &system);
+        m_is_exact = curvature == Curvature::full;
+        m_has_factor = system.factorize();
+        if (m_has_factor) return true;
+    }
+    return false;
+}
+
+/// Cut off no more negative curvature than needed, since it is what a sheet follows when it buckles: the share that it
+/// takes is searched from one step to the next.
+bool NewtonDirection::factorize_with_cloth(
+    const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system) {
+    bool failed = false;
+    for (;;) {
+        differentiate(zone, point, Curvature::full, derivatives, &system, m_cut);
+        m_is_exact = m_cut == kNothingCut;
+        m_has_factor = system.factorize();
+        if (m_has_factor) break;
+        if (m_cut == kAllCut) return false;
+        failed = true;
+        m_cut = m_cut == kNothingCut ? kFirstCut : std::min(kCutFactor * m_cut, kAllCut);
+    }
+    if (!failed) {
+        m_cut /= kCutFactor;
+        if (m_cut < kSmallestCut) m_cut = kNothingCut;
+    }
+    return true;
+}
+
+}  // namespace diffsim
