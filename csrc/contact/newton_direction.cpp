@@ -11,6 +11,7 @@ namespace {
 constexpr CutShare kSmallestCut = 1.0 / 256.0;
 constexpr CutShare kFirstCut = 1.0 / 16.0;  // where the exact Hessian is found to be indefinite
 constexpr double kCutFactor = 4.0;
+constexpr int kMaxDropped = 20;        // steps without the contacts' curvature: a landing takes fewer
 constexpr double kUnsettling = 1e-10;  // of the largest force: as little as the tolerance lets pass
 
 void set_to_descent(const Zone& zone, const ZoneDerivatives& derivatives, Coordinates& step) {
@@ -61,17 +62,21 @@ bool NewtonDirection::repeat(
     return solve(system, step);
 }
 
-/// Without the contacts' curvature where the exact Hessian is not positive definite. Next to their stiffness and to the
-/// bodies' inertia the positive part of that curvature is nothing, and costs eigenvalues of every contact.
+/// Where the exact Hessian is not positive definite, without the contacts' curvature: next to their stiffness and to the
+/// bodies' inertia its positive part is mostly nothing, and costs eigenvalues of every contact. But some heaps need it, and
+/// bodies that driven ones press on.
 bool NewtonDirection::factorize_bodies(
     const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system) {
-    for (const Curvature curvature : {Curvature::full, Curvature::dropped}) {
-        differentiate(zone, point, curvature, derivatives, &system);
-        m_is_exact = curvature == Curvature::full;
-        m_has_factor = system.factorize();
-        if (m_has_factor) return true;
-    }
-    return false;
+    differentiate(zone, point, Curvature::full, derivatives, &system);
+    m_is_exact = m_has_factor = system.factorize();
+    if (m_has_factor) return true;
+    ++m_indefinite;
+    if (zone.body_count() > zone.dynamic_count || m_indefinite > kMaxDropped)
+        differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
+    else
+        differentiate(zone, point, Curvature::dropped, derivatives, &system);
+    m_has_factor = system.factorize();
+    return m_has_factor;
 }
 
 /// Cut off no more negative curvature than needed, since it is what a sheet follows when it buckles: the share that it

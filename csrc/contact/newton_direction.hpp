@@ -27,6 +27,7 @@ private:
         const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system);
 
     CutShare m_cut = kNothingCut;  // of the next step
+    int m_indefinite = 0;          // steps of bodies so far where the exact Hessian was
     bool m_has_factor = false;
     bool m_is_exact = false;
 };
