@@ -63,18 +63,16 @@ bool NewtonDirection::repeat(
 }
 
 /// Where the exact Hessian is not positive definite, without the contacts' curvature: next to their stiffness and to the
-/// bodies' inertia its positive part is mostly nothing, and costs eigenvalues of every contact. But some heaps need it, and
-/// bodies that driven ones press on.
+/// bodies' inertia its positive part is mostly nothing, and costs eigenvalues of every contact. But some heaps need it.
 bool NewtonDirection::factorize_bodies(
     const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system) {
     differentiate(zone, point, Curvature::full, derivatives, &system);
     m_is_exact = m_has_factor = system.factorize();
     if (m_has_factor) return true;
-    ++m_indefinite;
-    if (zone.body_count() > zone.dynamic_count || m_indefinite > kMaxDropped)
-        differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
-    else
+    if (m_indefinite++ < kMaxDropped)
         differentiate(zone, point, Curvature::dropped, derivatives, &system);
+    else
+        differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
     m_has_factor = system.factorize();
     return m_has_factor;
 }

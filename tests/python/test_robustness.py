@@ -32,6 +32,14 @@ def test_random_scenes() -> None:
     assert ": 0 scenes with problems" in found.stdout
 
 
+@pytest.mark.parametrize(("scene", "steps"), [(1, 34), (26, 6)])
+def test_heaps_whose_hessian_is_indefinite_converge(scene: int, steps: int) -> None:
+    """Scenes with a step that does not converge if contacts' curvature is always left out."""
+    options = ["--scenes", "1", "--first", str(scene), "--steps", str(steps)]
+    found = subprocess.run([sys.executable, str(FUZZ), *options], capture_output=True, text=True, check=False)
+    assert f"0 of {steps} steps in 0 scenes did not converge" in found.stdout, found.stdout + found.stderr
+
+
 def test_derivatives_in_random_scenes_with_cloth() -> None:
     """No derivative of a step disagrees with central differences of every step size."""
     options = ["--scenes", "3", "--steps", "60", "--bodies", "4", "--cloths", "1", "--gradients", "20"]
