@@ -60,7 +60,7 @@ struct ContactTerm {
     int side_count = 2;
     SmallVector row, gradient;
     SmallMatrix hessian;
-    double force, stiffness;
+    double stiffness;
 
     /// Call body_part(body, offset) and node_part(node, offset) for everything the term is taken along.
     template <class BodyPart, class NodePart>
@@ -93,7 +93,7 @@ public:
             if (contact.cloth_a >= 0)
                 node_on_ground(contact, active, term);
             else
-                body_on_ground(contact, active, curvature, term);
+                body_on_ground(contact, active, term);
             return term;
         }
         if (contact.cloth_a >= 0)
@@ -131,22 +131,16 @@ private:
         term.row = d.row;
         term.gradient = d.gradient;
         if (with_hessian) term.hessian = d.hessian;
-        term.force = d.force;
         term.stiffness = d.stiffness;
     }
 
-    void body_on_ground(
-        const ZoneContact& contact, const ActiveContact& active, Curvature curvature, ContactTerm& term) const {
+    void body_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
         term.sides[0].body = contact.a;
-        const bool with_hessian = curvature != Curvature::none;
-        const GroundDerivatives d = ground_derivatives(
-            active.geometry.distance, active.geometry.closest.point_a - m_point.poses[contact.a].t, contact.range,
-            contact.stiffness.value, with_hessian, curvature != Curvature::dropped);
-        term.row = d.row;
-        term.gradient = -d.force * d.row;
-        if (with_hessian) term.hessian = d.hessian;
-        term.force = d.force;
-        term.stiffness = d.stiffness;
+        term.row = GroundContacts::row(active.geometry.closest.point_a - m_point.poses[contact.a].t);
+        term.stiffness = contact_potential(
+                             contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
+                             contact.stiffness.value)
+                             .stiffness;
     }
 
     void node_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
@@ -157,7 +151,6 @@ private:
         term.row = Vec3::UnitZ();
         term.gradient = -potential.force * term.row;
         term.hessian = potential.stiffness * term.row * term.row.transpose();
-        term.force = potential.force;
         term.stiffness = potential.stiffness;
     }
 
@@ -393,20 +386,33 @@ Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, cons
     return share;
 }
 
+/// What contacts add to the gradients of masses through their stiffness, between bodies and with the ground.
+void add_body_stiffness(
+    const Zone& zone, const std::vector<BodyContacts>& contacts, const std::vector<Vec6>& twist, ZoneAdjoint& result) {
+    for (const BodyContacts& c : contacts) {
+        double along = 0.0;
+        for (const auto& [body, part] : {std::pair<int, Vec6>(c.a, c.gradient.head<6>()), {c.b, c.gradient.tail<6>()}})
+            if (zone.yields(body)) along += part.dot(twist[body]);
+        if (zone.yields(c.a)) result.mass_gradient[c.a] -= along * c.stiffness.log_gradient_a;
+        if (zone.yields(c.b)) result.mass_gradient[c.b] -= along * c.stiffness.log_gradient_b;
+    }
+}
+
 /// What contacts add to the gradients: to those of places that the linear system has no rows for, `twist` times their
-/// second derivatives and the reactions of hard ones; to those of masses, through their stiffness.
+/// second derivatives and the reactions of hard ones; with cloth, to those of masses, through their stiffness.
 /// `multipliers`: stiffness times what opens each contact along `twist`, where contacts are rows of constant direction;
 /// null where they have curvature.
 void add_contacts(
     const Zone& zone, const ZonePoint& point, const VectorX* multipliers, const GradientNeeds& needs,
     const std::vector<Vec6>& twist, const std::vector<double>& reactions, ZoneAdjoint& result) {
     const ContactTermMaker make_term(zone, point);
-    const bool through_stiffness = needs.mass && !zone.hard;  // a hard one's is only how its multiplier was found
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
         const bool of_bodies = zone.yields(contact.a) && (contact.contact.with_ground() || zone.yields(contact.b));
         const bool with_place = needs.place && !of_bodies;
+        // A hard contact's stiffness is only how its multiplier was found.
+        const bool through_stiffness = needs.mass && !zone.hard && (contact.cloth_a >= 0 || contact.cloth_b >= 0);
         if (!with_place && !through_stiffness) continue;
         const ContactTerm term =
             make_term(active, with_place && multipliers == nullptr ? Curvature::full : Curvature::none);
@@ -541,6 +547,10 @@ const ZoneAdjoint& zone_adjoint(
             -contact_share(zone.bodies[i], point.y.bodies[i], torque, upstream.bodies[i], result.multiplier.bodies[i]);
         // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
         gradient.head<3>() -= 0.5 * torque.cross(twist[i].head<3>());
+    }
+    if (needs.mass && !zone.hard) {
+        if (!exact) differentiate(zone, point, Curvature::none, derivatives, nullptr);
+        add_body_stiffness(zone, derivatives.body_contacts, twist, result);
     }
     if (needs.place || needs.mass)
         add_contacts(zone, point, exact ? nullptr : &multipliers, needs, twist, reactions, result);

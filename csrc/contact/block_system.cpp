@@ -68,10 +68,7 @@ bool BlockSystem::is_sparse() const { return m_pattern.node_count > 0 || m_patte
 bool BlockSystem::factorize() {
     if (is_sparse()) return factorize_sparse();
     const int count = m_pattern.body_count;
-    if (count == 1) {
-        m_single = m_diagonal[0];
-        return Eigen::internal::llt_inplace<double, Eigen::Lower>::unblocked(m_single) == -1;
-    }
+    if (count == 1) return m_single.factorize(m_diagonal[0]);
     m_dense.setZero(6 * count, 6 * count);
     for (int i = 0; i < count; ++i) m_dense.block<6, 6>(6 * i, 6 * i) = m_diagonal[i];
     for (std::size_t k = 0; k < m_pattern.body_pairs.size(); ++k) {
@@ -130,16 +127,10 @@ void BlockSystem::solve_in_place(Coordinates& rhs) const {
             rhs.nodes[i] = Eigen::Map<Vec3>(x.data() + body_rows + 3 * i);
         return;
     }
-    const auto solve = [](const auto& factor, auto&& x) {
-        factor.template triangularView<Eigen::Lower>().solveInPlace(x);
-        factor.template triangularView<Eigen::Lower>().transpose().solveInPlace(x);
-    };
-    if (m_pattern.body_count == 1) {
-        solve(m_single, rhs.bodies[0]);
-    } else {
-        Eigen::Map<VectorX> x(rhs.bodies[0].data(), 6 * m_pattern.body_count);
-        solve(m_dense, x);
-    }
+    if (m_pattern.body_count == 1) return m_single.solve_in_place(rhs.bodies[0]);
+    Eigen::Map<VectorX> x(rhs.bodies[0].data(), 6 * m_pattern.body_count);
+    m_dense.triangularView<Eigen::Lower>().solveInPlace(x);
+    m_dense.triangularView<Eigen::Lower>().transpose().solveInPlace(x);
 }
 
 HalfSolution BlockSystem::half_solve(const int* nodes, const Vec3* values, int count) const {

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "contact/coordinates.hpp"
+#include "math/small_cholesky.hpp"
 #include "math/sparse_block_cholesky.hpp"
 
 namespace diffsim {
@@ -79,7 +80,7 @@ private:
     std::vector<Mat3> m_node_diagonal, m_node_pairs;
     std::vector<Mat63> m_mixed_pairs;
     std::vector<int> m_node_first, m_mixed_first;  // where the pairs of each node, of each body begin
-    Mat6 m_single;                                 // Cholesky factor of one body
+    SmallCholesky<6> m_single;                     // factor of one body
     MatrixX m_dense;                               // Cholesky factor of a few
     std::unique_ptr<SparseFactor> m_sparse;
     bool m_pattern_changed = true;

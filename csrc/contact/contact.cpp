@@ -40,7 +40,7 @@ ClosestPoints swapped(const ClosestPoints& points) {
     ClosestPoints result = points;
     std::swap(result.point_a, result.point_b);
     std::swap(result.slide_count_a, result.slide_count_b);
-    std::swap(result.slide_a, result.slide_b);
+    std::swap(result.edge_a, result.edge_b);
     return result;
 }
 
@@ -74,18 +74,14 @@ ContactGeometry contact_geometry(const Contact& contact, const Surface& a, const
         case ContactType::edge_edge: {
             const Ends ends_a(a, contact.feature_a), ends_b(b, contact.feature_b);
             geometry.closest = closest_edge_edge(ends_a.x[0], ends_a.x[1], ends_b.x[0], ends_b.x[1]);
-            const Vec3 da = ends_a.x[1] - ends_a.x[0], db = ends_b.x[1] - ends_b.x[0];
+            const Vec3 &da = geometry.closest.edge_a, &db = geometry.closest.edge_b;
             geometry.sine_sq = da.cross(db).squaredNorm() / (da.squaredNorm() * db.squaredNorm());
-            if (geometry.sine_sq < kParallelLimit) {
-                geometry.direction_a = da.normalized();
-                geometry.direction_b = db.normalized();
-            }
             break;
         }
     }
     const Vec3 offset = geometry.closest.point_a - geometry.closest.point_b;
     geometry.distance = offset.norm();
-    geometry.normal = geometry.distance > 0.0 ? Vec3(offset / geometry.distance) : Vec3(Vec3::Zero());
+    geometry.normal = geometry.distance > 0.0 ? Vec3((1.0 / geometry.distance) * offset) : Vec3(Vec3::Zero());
     return geometry;
 }
 

@@ -38,11 +38,10 @@ struct Surface {
 };
 
 struct ContactGeometry {
-    double distance;                ///< between the bare meshes, margins not taken off [m]
-    Vec3 normal;                    ///< unit, from b to a
-    ClosestPoints closest;          ///< in world axes
-    double sine_sq = 1.0;           ///< of the angle between two edges; 1 for other pairs
-    Vec3 direction_a, direction_b;  ///< unit directions of the two edges, set where sine_sq < kParallelLimit
+    double distance;        ///< between the bare meshes, margins not taken off [m]
+    Vec3 normal;            ///< unit, from b to a
+    ClosestPoints closest;  ///< in world axes
+    double sine_sq = 1.0;   ///< of the angle between two edges; 1 for other pairs
 };
 
 /// Distance and all that its derivatives need. `ground_height` is the ground's in the frame of the surfaces; b is not used

@@ -25,16 +25,13 @@ Mat3 turn_curvature(const Vec3& r, const Vec3& n) {
 class TurnMotion {
 public:
     static constexpr int kSize = 3;
-    static constexpr int kSlideSize = 3;  ///< the first coordinates, which alone change the slide directions
+    static constexpr int kTurnSize = 3;  ///< the first coordinates, which alone change directions
     TurnMotion(const BodySide& side, const Vec3& point) : m_arm(point - side.center) {}
 
     /// n · d(point).
     Vec3 row(const Vec3& n) const { return m_arm.cross(n); }
-    /// Add n · d²(point), times a factor.
-    template <class Block>
-    void add_point_curvature(const Vec3& n, double factor, Block&& hessian) const {
-        hessian += factor * turn_curvature(m_arm, n);
-    }
+    /// n · d²(point).
+    Mat3 point_curvature(const Vec3& n) const { return turn_curvature(m_arm, n); }
     /// n · d(slide direction k).
     Vec3 slide(int, const Vec3& direction, const Vec3& n) const { return direction.cross(n); }
     /// d(unit direction of an edge).
@@ -50,7 +47,7 @@ private:
 class BodyMotion {
 public:
     static constexpr int kSize = 6;
-    static constexpr int kSlideSize = 3;
+    static constexpr int kTurnSize = 3;
     BodyMotion(const BodySide& side, const Vec3& point) : m_turn(side, point) {}
 
     Vec6 row(const Vec3& n) const {
@@ -58,20 +55,11 @@ public:
         result << m_turn.row(n), n;
         return result;
     }
-    template <class Block>
-    void add_point_curvature(const Vec3& n, double factor, Block&& hessian) const {
-        m_turn.add_point_curvature(n, factor, hessian.template topLeftCorner<3, 3>());
-    }
+    Mat3 point_curvature(const Vec3& n) const { return m_turn.point_curvature(n); }
     Vec3 slide(int k, const Vec3& direction, const Vec3& n) const { return m_turn.slide(k, direction, n); }
-    Rows3<6> direction(const Vec3& unit) const {
-        Rows3<6> result = Rows3<6>::Zero();
-        result.leftCols<3>() = m_turn.direction(unit);
-        return result;
-    }
-    Mat6 direction_curvature(const Vec3& unit, const Vec3& other) const {
-        Mat6 result = Mat6::Zero();
-        result.topLeftCorner<3, 3>() = m_turn.direction_curvature(unit, other);
-        return result;
+    Mat3 direction(const Vec3& unit) const { return m_turn.direction(unit); }
+    Mat3 direction_curvature(const Vec3& unit, const Vec3& other) const {
+        return m_turn.direction_curvature(unit, other);
     }
 
 private:
@@ -82,12 +70,11 @@ private:
 class ClothMotion {
 public:
     static constexpr int kSize = 9;
-    static constexpr int kSlideSize = 9;
+    static constexpr int kTurnSize = 9;
     ClothMotion(const ClothSide& side, const Vec3&) : m_side(side) {}
 
     Vector<9> row(const Vec3& n) const { return weighted(m_side.weights, n); }
-    template <class Block>
-    void add_point_curvature(const Vec3&, double, Block&&) const {}
+    Square<9> point_curvature(const Vec3&) const { return Square<9>::Zero(); }
     Vector<9> slide(int k, const Vec3&, const Vec3& n) const { return weighted(m_side.slide[k], n); }
     Rows3<9> direction(const Vec3& unit) const {
         const Mat3 projector = (Mat3::Identity() - unit * unit.transpose()) / m_side.edge_length;
@@ -130,96 +117,118 @@ Vector<A::kSize + B::kSize> relative_row(const A& a, const B& b, const Vec3& dir
     return row;
 }
 
-/// Add factor * r rᵀ.
-template <int N>
-void add_square(const Vector<N>& r, double factor, Square<N>& hessian) {
-    hessian.noalias() += (factor * r) * r.transpose();
+/// Orthonormal directions along which the closest point of an object slides, as many as its count says.
+std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a) {
+    const ClosestPoints& points = geometry.closest;
+    const int count = of_a ? points.slide_count_a : points.slide_count_b;
+    if (count == 0) return {Vec3::Zero(), Vec3::Zero()};
+    if (count == 1) return {(of_a ? points.edge_a : points.edge_b).normalized(), Vec3::Zero()};
+    const Vec3 first = geometry.normal.unitOrthogonal();
+    return {first, geometry.normal.cross(first)};
 }
 
-/// Add r qᵀ + q rᵀ, q being zero but for the coordinates from `first` on.
-template <int N, int M>
-void add_symmetric(const Vector<N>& r, const Vector<M>& q, int first, Square<N>& hessian) {
-    const Eigen::Matrix<double, N, M> product = r * q.transpose();
-    hessian.template middleCols<M>(first) += product;
-    hessian.template middleRows<M>(first) += product.transpose();
-}
-
+/// Hessians are added up as halves: what is meant is half + halfᵀ.
+///
 /// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|. With W = dw/dy,
 /// S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is orthogonal to S and n:
 ///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy²  =  WᵀNW/d - X - Xᵀ + n · d²w/dy²,  X = (SᵀW + ½ d q)ᵀ G q.
 /// A slide of one object changes its direction with the coordinates of that object alone.
 template <class A, class B>
 void add_distance_hessian(
-    const ContactGeometry& geometry, const A& a, const B& b, double factor, Square<A::kSize + B::kSize>& hessian) {
+    const ContactGeometry& geometry, const A& a, const B& b, double factor, Square<A::kSize + B::kSize>& half) {
     constexpr int kSize = A::kSize + B::kSize;
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
     const ClosestPoints& points = geometry.closest;
-    a.add_point_curvature(n, factor, hessian.template topLeftCorner<A::kSize, A::kSize>());
-    b.add_point_curvature(n, -factor, hessian.template bottomRightCorner<B::kSize, B::kSize>());
+    half.template topLeftCorner<A::kTurnSize, A::kTurnSize>() += (0.5 * factor) * a.point_curvature(n);
+    half.template block<B::kTurnSize, B::kTurnSize>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(n);
 
+    const auto add_tangent = [&](const Vec3& tangent) {
+        const Vector<kSize> row = relative_row(a, b, tangent);
+        half.noalias() += ((0.5 * factor / d) * row) * row.transpose();
+    };
     const int count_a = points.slide_count_a, count = count_a + points.slide_count_b;
     if (count == 0) {
         const Vec3 tangent = n.unitOrthogonal();
-        add_square(relative_row(a, b, tangent), factor / d, hessian);
-        add_square(relative_row(a, b, n.cross(tangent)), factor / d, hessian);
+        add_tangent(tangent);
+        add_tangent(n.cross(tangent));
         return;
     }
+    const std::array<Vec3, 2> slides_a = slide_directions(geometry, true), slides_b = slide_directions(geometry, false);
     std::array<Vec3, 2> S;
-    std::array<Vector<A::kSlideSize>, 2> q_a;
-    std::array<Vector<B::kSlideSize>, 2> q_b;
-    Eigen::Matrix<double, kSize, 2> P = Eigen::Matrix<double, kSize, 2>::Zero();  // its columns SᵀW + ½ d q
+    std::array<Vector<A::kTurnSize>, 2> q_a;
+    std::array<Vector<B::kTurnSize>, 2> q_b;
+    std::array<Vector<kSize>, 2> P;  // SᵀW + ½ d q
+    P[1].setZero();
     for (int k = 0; k < count; ++k) {
         if (k < count_a) {
-            S[k] = points.slide_a[k];
+            S[k] = slides_a[k];
             q_a[k] = a.slide(k, S[k], n);
-            P.col(k) = relative_row(a, b, S[k]);
-            P.col(k).template head<A::kSlideSize>() += 0.5 * d * q_a[k];
+            P[k] = relative_row(a, b, S[k]);
+            P[k].template head<A::kTurnSize>() += 0.5 * d * q_a[k];
         } else {
-            S[k] = -points.slide_b[k - count_a];
-            q_b[k] = -b.slide(k - count_a, points.slide_b[k - count_a], n);
-            P.col(k) = relative_row(a, b, S[k]);
-            P.col(k).template segment<B::kSlideSize>(A::kSize) += 0.5 * d * q_b[k];
+            S[k] = -slides_b[k - count_a];
+            q_b[k] = -b.slide(k - count_a, slides_b[k - count_a], n);
+            P[k] = relative_row(a, b, S[k]);
+            P[k].template segment<B::kTurnSize>(A::kSize) += 0.5 * d * q_b[k];
         }
     }
     Eigen::Matrix2d G = Eigen::Matrix2d::Identity();
     if (count == 1) {
-        add_square(relative_row(a, b, n.cross(S[0])), factor / d, hessian);
+        add_tangent(n.cross(S[0]));
     } else if (count_a == 1) {  // one of each edge; those of a patch are orthonormal
         const double g = S[0].dot(S[1]);
         G << 1.0, -g, -g, 1.0;
         G /= S[0].cross(S[1]).squaredNorm();
     }
     for (int k = 0; k < count; ++k) {
-        const Vector<kSize> PG = -factor * (G(0, k) * P.col(0) + G(1, k) * P.col(1));
+        const Vector<kSize> PG = -factor * (G(0, k) * P[0] + G(1, k) * P[1]);
         if (k < count_a)
-            add_symmetric(PG, q_a[k], 0, hessian);
+            half.template leftCols<A::kTurnSize>().noalias() += PG * q_a[k].transpose();
         else
-            add_symmetric(PG, q_b[k], A::kSize, hessian);
+            half.template middleCols<B::kTurnSize>(A::kSize).noalias() += PG * q_b[k].transpose();
     }
 }
 
-/// The squared sine c = 1 - g² of the angle between two edges, g the cosine, and its derivatives.
-template <int N>
-struct AngleDerivatives {
-    Vector<N> gradient;
-    Square<N> hessian;
-};
-
+/// The squared sine c = 1 - g² of the angle between two edges, through their cosine g. Shifts of bodies do not change it.
 template <class A, class B>
-AngleDerivatives<A::kSize + B::kSize> angle_derivatives(const ContactGeometry& geometry, const A& a, const B& b) {
-    constexpr int kA = A::kSize, kB = B::kSize;
-    const Vec3 &da = geometry.direction_a, &db = geometry.direction_b;
-    const double g = da.dot(db);
-    const Rows3<kA> Da = a.direction(da);
-    const Rows3<kB> Db = b.direction(db);
-    Vector<kA + kB> g_gradient;
-    g_gradient << Da.transpose() * db, Db.transpose() * da;
-    Square<kA + kB> g_hessian;
-    const Eigen::Matrix<double, kA, kB> cross = Da.transpose().lazyProduct(Db);
-    g_hessian << a.direction_curvature(da, db), cross, cross.transpose(), b.direction_curvature(db, da);
-    return {-2.0 * g * g_gradient, -2.0 * (g_gradient * g_gradient.transpose() + g * g_hessian)};
-}
+struct Angle {
+    static constexpr int kA = A::kTurnSize, kB = B::kTurnSize;
+    const A& a;
+    const B& b;
+    Vec3 direction_a, direction_b;
+    double cosine;
+    Rows3<kA> turn_a;  ///< d(direction_a)
+    Rows3<kB> turn_b;
+    Vector<kA> gradient_a;  ///< of the cosine
+    Vector<kB> gradient_b;
+
+    Angle(const ContactGeometry& geometry, const A& motion_a, const B& motion_b)
+        : a(motion_a),
+          b(motion_b),
+          direction_a(geometry.closest.edge_a.normalized()),
+          direction_b(geometry.closest.edge_b.normalized()),
+          cosine(direction_a.dot(direction_b)),
+          turn_a(a.direction(direction_a)),
+          turn_b(b.direction(direction_b)),
+          gradient_a(turn_a.transpose() * direction_b),
+          gradient_b(turn_b.transpose() * direction_a) {}
+
+    /// Add v dgᵀ.
+    template <class Half, class V>
+    void add_outer(const V& v, Half& half) const {
+        half.template leftCols<kA>().noalias() += v * gradient_a.transpose();
+        half.template middleCols<kB>(A::kSize).noalias() += v * gradient_b.transpose();
+    }
+    /// Add, times a factor, half of d²g.
+    template <class Half>
+    void add_hessian(double factor, Half& half) const {
+        half.template topLeftCorner<kA, kA>() += (0.5 * factor) * a.direction_curvature(direction_a, direction_b);
+        half.template block<kB, kB>(A::kSize, A::kSize) +=
+            (0.5 * factor) * b.direction_curvature(direction_b, direction_a);
+        half.template block<kA, kB>(0, A::kSize).noalias() += factor * (turn_a.transpose() * turn_b);
+    }
+};
 
 /// Rates of a triangle's barycentric coordinates along a direction in its plane.
 Vec3 barycentric_rates(const Vec3& e1, const Vec3& e2, const Vec3& direction) {
@@ -236,8 +245,6 @@ ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, co
     ClothSide side;
     const ClosestPoints& points = geometry.closest;
     const Vec3& point = of_a ? points.point_a : points.point_b;
-    const int slide_count = of_a ? points.slide_count_a : points.slide_count_b;
-    const std::array<Vec3, 2>& slides = of_a ? points.slide_a : points.slide_b;
     const std::array<int, 3> v = feature_vertices(*cloth.mesh, contact, of_a);
     if (v[1] < 0) {
         side.weights[0] = 1.0;
@@ -255,7 +262,8 @@ ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, co
     } else {
         const Vec3 x0 = cloth.vertex(v[0]), e1 = cloth.vertex(v[1]) - x0, e2 = cloth.vertex(v[2]) - x0;
         side.weights = Vec3::UnitX() + barycentric_rates(e1, e2, point - x0);
-        for (int k = 0; k < slide_count; ++k) side.slide[k] = barycentric_rates(e1, e2, slides[k]);
+        const std::array<Vec3, 2> slides = slide_directions(geometry, of_a);
+        for (int k = 0; k < 2; ++k) side.slide[k] = barycentric_rates(e1, e2, slides[k]);
         return side;
     }
     if (code != 2) {
@@ -288,12 +296,13 @@ double contact_energy(const ContactGeometry& geometry, const ContactRange& range
 
 namespace {
 
+/// The second derivative is added to `half`, unless that is null.
 template <class A, class B>
-ContactDerivatives<A::kSize + B::kSize> derivatives_along(
+ContactForce<A::kSize + B::kSize> derivatives_along(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
-    bool with_hessian, bool with_curvature) {
+    bool with_curvature, Square<A::kSize + B::kSize>* half) {
     constexpr int kSize = A::kSize + B::kSize;
-    ContactDerivatives<kSize> result;
+    ContactForce<kSize> result;
     result.row = relative_row(a, b, geometry.normal);
     const PotentialValue potential =
         contact_potential(range.rest - geometry.distance, range.rest - range.pole, stiffness);
@@ -302,75 +311,117 @@ ContactDerivatives<A::kSize + B::kSize> derivatives_along(
     result.force = mollifier.value * potential.force;
     result.stiffness = mollifier.value * potential.stiffness;
     result.gradient = -result.force * result.row;
-    AngleDerivatives<kSize> angle;
-    if (mollified) {
-        angle = angle_derivatives(geometry, a, b);
-        result.gradient += potential.energy * mollifier.first * angle.gradient;
+    if (half != nullptr) {
+        half->noalias() += ((0.5 * result.stiffness) * result.row) * result.row.transpose();
+        if (with_curvature && result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, *half);
     }
-    if (!with_hessian) return result;
-    result.hessian.noalias() = (result.stiffness * result.row) * result.row.transpose();
-    if (!with_curvature) return result;
-    if (result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, result.hessian);
-    if (mollified) {
-        const Square<kSize> cross = result.row * angle.gradient.transpose();
-        result.hessian -= potential.force * mollifier.first * (cross + cross.transpose());
-        result.hessian += potential.energy * (mollifier.second * (angle.gradient * angle.gradient.transpose()) +
-                                              mollifier.first * angle.hessian);
-    }
+    if (!mollified) return result;
+    // Mollifier mu(c), c = 1 - g², times potential: along dg, mu' = -2 g mu'(c) and mu'' = 4 g² mu''(c) - 2 mu'(c).
+    const Angle<A, B> angle(geometry, a, b);
+    const double g = angle.cosine, first = -2.0 * g * mollifier.first;
+    const double second = 4.0 * g * g * mollifier.second - 2.0 * mollifier.first;
+    Vector<kSize> gradient = Vector<kSize>::Zero();
+    gradient.template head<A::kTurnSize>() = angle.gradient_a;
+    gradient.template segment<B::kTurnSize>(A::kSize) = angle.gradient_b;
+    result.gradient += (potential.energy * first) * gradient;
+    if (half == nullptr || !with_curvature) return result;
+    const Vector<kSize> along = (0.5 * potential.energy * second) * gradient - (potential.force * first) * result.row;
+    angle.add_outer(along, *half);
+    angle.add_hessian(potential.energy * first, *half);
     return result;
 }
 
-/// From (turn of a, turn of b, shift of b) to both twists: a shift of a is the opposite shift of b.
-ContactDerivatives<12> both_twists(const ContactDerivatives<9>& relative, bool with_hessian) {
-    constexpr std::array<int, 4> kFrom = {0, 6, 3, 6};  // where the turns and shifts of a and of b come from
-    constexpr std::array<double, 4> kSign = {1.0, -1.0, 1.0, 1.0};
-    ContactDerivatives<12> result;
-    result.force = relative.force;
-    result.stiffness = relative.stiffness;
-    for (int i = 0; i < 4; ++i) {
-        result.row.segment<3>(3 * i) = kSign[i] * relative.row.segment<3>(kFrom[i]);
-        result.gradient.segment<3>(3 * i) = kSign[i] * relative.gradient.segment<3>(kFrom[i]);
-        if (!with_hessian) continue;
-        for (int j = 0; j < 4; ++j)
-            result.hessian.block<3, 3>(3 * i, 3 * j) =
-                kSign[i] * kSign[j] * relative.hessian.block<3, 3>(kFrom[i], kFrom[j]);
-    }
-    return result;
-}
+// Where the turns and shifts of a and of b come from, and with which sign: a shift of a is the opposite shift of b.
+constexpr std::array<int, 4> kRelativeFrom = {0, 6, 3, 6};
+constexpr std::array<double, 4> kRelativeSign = {1.0, -1.0, 1.0, 1.0};
 
 }  // namespace
+
+ContactForce<9> add_relative_derivatives(
+    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
+    bool with_curvature, Square<9>* half) {
+    return derivatives_along(
+        geometry, range, stiffness, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b),
+        with_curvature, half);
+}
+
+Vector<12> both_twists(const Vector<9>& relative) {
+    Vector<12> result;
+    for (int i = 0; i < 4; ++i) result.segment<3>(3 * i) = kRelativeSign[i] * relative.segment<3>(kRelativeFrom[i]);
+    return result;
+}
+
+Square<12> both_twists(const Square<9>& relative) {
+    Square<12> result;
+    for (int i = 0; i < 4; ++i)
+        for (int j = 0; j < 4; ++j)
+            result.block<3, 3>(3 * i, 3 * j) =
+                kRelativeSign[i] * kRelativeSign[j] * relative.block<3, 3>(kRelativeFrom[i], kRelativeFrom[j]);
+    return result;
+}
 
 template <class A, class B>
 ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& side_a, const B& side_b,
     bool with_hessian, bool with_curvature) {
-    const Vec3 &point_a = geometry.closest.point_a, &point_b = geometry.closest.point_b;
-    if constexpr (std::is_same_v<A, BodySide> && std::is_same_v<B, BodySide>)
-        return both_twists(
-            derivatives_along(
-                geometry, range, stiffness, TurnMotion(side_a, point_a), BodyMotion(side_b, point_b), with_hessian,
-                with_curvature),
-            with_hessian);
-    else
-        return derivatives_along(
-            geometry, range, stiffness, motion_of(side_a, point_a), motion_of(side_b, point_b), with_hessian,
-            with_curvature);
+    ContactDerivatives<A::kSize + B::kSize> result;
+    if constexpr (std::is_same_v<A, BodySide> && std::is_same_v<B, BodySide>) {
+        Square<9> half = Square<9>::Zero();
+        const ContactForce<9> relative = add_relative_derivatives(
+            geometry, range, stiffness, side_a, side_b, with_curvature, with_hessian ? &half : nullptr);
+        result.force = relative.force;
+        result.stiffness = relative.stiffness;
+        result.gradient = both_twists(relative.gradient);
+        result.row = both_twists(relative.row);
+        if (with_hessian) result.hessian = both_twists(Square<9>(half + half.transpose()));
+    } else {
+        using Hessian = Square<A::kSize + B::kSize>;
+        Hessian half = Hessian::Zero();
+        static_cast<ContactForce<A::kSize + B::kSize>&>(result) = derivatives_along(
+            geometry, range, stiffness, motion_of(side_a, geometry.closest.point_a),
+            motion_of(side_b, geometry.closest.point_b), with_curvature, with_hessian ? &half : nullptr);
+        if (with_hessian) result.hessian = half + half.transpose();
+    }
+    return result;
 }
 
-GroundDerivatives ground_derivatives(
-    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_hessian,
-    bool with_curvature) {
+Vec6 GroundContacts::row(const Vec3& arm) {
+    Vec6 row;
+    row << arm.y(), -arm.x(), 0.0, 0.0, 0.0, 1.0;
+    return row;
+}
+
+PotentialValue GroundContacts::add(double height, const Vec3& arm, const ContactRange& range, double stiffness) {
     const PotentialValue potential = contact_potential(range.rest - height, range.rest - range.pole, stiffness);
-    GroundDerivatives result;
-    result.force = potential.force;
-    result.stiffness = potential.stiffness;
-    result.row << arm.y(), -arm.x(), 0.0, 0.0, 0.0, 1.0;
-    if (!with_hessian) return result;
-    result.hessian.setZero();
-    for (int i : {0, 1, 5})
-        for (int j : {0, 1, 5}) result.hessian(i, j) = potential.stiffness * result.row[i] * result.row[j];
-    if (with_curvature) result.hessian.topLeftCorner<3, 3>() -= potential.force * turn_curvature(arm, Vec3::UnitZ());
-    return result;
+    m_force += potential.force;
+    m_force_arm += potential.force * arm;
+    const double k = potential.stiffness, kx = k * arm.x(), ky = k * arm.y();
+    m_moments[0] += k;
+    m_moments[1] += kx;
+    m_moments[2] += ky;
+    m_moments[3] += kx * arm.x();
+    m_moments[4] += kx * arm.y();
+    m_moments[5] += ky * arm.y();
+    return potential;
+}
+
+Vec6 GroundContacts::gradient() const {
+    Vec6 gradient;
+    gradient << -m_force_arm.y(), m_force_arm.x(), 0.0, 0.0, 0.0, -m_force;
+    return gradient;
+}
+
+Mat6 GroundContacts::hessian(bool with_curvature) const {
+    Mat6 hessian = Mat6::Zero();
+    const auto set = [&](int i, int j, double value) { hessian(i, j) = hessian(j, i) = value; };
+    set(0, 0, m_moments[5]);
+    set(0, 1, -m_moments[4]);
+    set(0, 5, m_moments[2]);
+    set(1, 1, m_moments[3]);
+    set(1, 5, -m_moments[1]);
+    set(5, 5, m_moments[0]);
+    if (with_curvature) hessian.topLeftCorner<3, 3>() -= turn_curvature(m_force_arm, Vec3::UnitZ());
+    return hessian;
 }
 
 // The pairs of sides there are.

@@ -32,14 +32,19 @@ using Vector = Eigen::Matrix<double, N, 1>;
 template <int N>
 using Square = Eigen::Matrix<double, N, N>;
 
-/// The energy's first and second derivatives along the coordinates of a and of b.
+/// The energy's first derivative along the coordinates of a and of b, and what it is made of.
 template <int N>
-struct ContactDerivatives {
+struct ContactForce {
     Vector<N> gradient;  ///< minus the force on each coordinate, times step²
+    Vector<N> row;       ///< the distance's gradient: the contact's row in the paper's J
+    double force;        ///< along the row [kg·m]
+    double stiffness;    ///< along the row, of the (mollified) potential [kg]
+};
+
+/// With the second.
+template <int N>
+struct ContactDerivatives : ContactForce<N> {
     Square<N> hessian;
-    Vector<N> row;     ///< the distance's gradient: the contact's row in the paper's J
-    double force;      ///< along the row [kg·m]
-    double stiffness;  ///< along the row, of the (mollified) potential [kg]
 };
 
 /// Derivative of the distance.
@@ -56,14 +61,31 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
     bool with_hessian, bool with_curvature);
 
-/// The same for a vertex of a rigid body above the ground, where they are short.
-struct GroundDerivatives {
-    Vec6 row;  ///< of the height, along the twist
-    Mat6 hessian;
-    double force, stiffness;
+/// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. Unless `half` is null, adds
+/// to it a matrix that together with its transpose is the second derivative.
+ContactForce<9> add_relative_derivatives(
+    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
+    bool with_curvature, Square<9>* half);
+
+/// From there to the twists of a and of b.
+Vector<12> both_twists(const Vector<9>& relative);
+Square<12> both_twists(const Square<9>& relative);
+
+/// The same of a rigid body's vertices above the ground, where they are short: of all its contacts together.
+class GroundContacts {
+public:
+    /// Of the height, along the twist, for a vertex with this arm from the centre of mass.
+    static Vec6 row(const Vec3& arm);
+    /// One more vertex. Returns its energy with respect to its compression.
+    PotentialValue add(double height, const Vec3& arm, const ContactRange& range, double stiffness);
+
+    Vec6 gradient() const;
+    Mat6 hessian(bool with_curvature) const;
+
+private:
+    double m_force = 0.0, m_stiffness = 0.0;
+    Vec3 m_force_arm = Vec3::Zero();  // sum of force * arm
+    Vec6 m_moments = Vec6::Zero();    // sums of stiffness * (1, x, y, xx, xy, yy), arm = (x, y, z)
 };
-GroundDerivatives ground_derivatives(
-    double height, const Vec3& arm, const ContactRange& range, double stiffness, bool with_hessian,
-    bool with_curvature);
 
 }  // namespace diffsim

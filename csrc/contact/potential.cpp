@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 namespace diffsim {
 namespace {
@@ -10,18 +9,6 @@ namespace {
 constexpr double kMassRatioKnee = 100.0;
 
 }  // namespace
-
-PotentialValue contact_potential(double compression, double pole, double stiffness) {
-    if (!(compression > 0.0)) return {0.0, 0.0, 0.0};
-    const double rest = 1.0 - compression / pole;
-    if (!(rest > 0.0)) {
-        constexpr double infinity = std::numeric_limits<double>::infinity();
-        return {infinity, infinity, infinity};
-    }
-    return {
-        0.5 * stiffness * compression * compression / rest,
-        stiffness * compression * (1.0 - 0.5 * compression / pole) / (rest * rest), stiffness / (rest * rest * rest)};
-}
 
 double hard_contact_shift(double force, double pole, double stiffness) {
     // phi' at p = s, P = pole + s, is k s (1 + s / pole) (1 + s / (2 pole)): at least its linear and its cubic term, and convex,

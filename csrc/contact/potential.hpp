@@ -1,5 +1,7 @@
 #pragma once
 
+#include "math/types.hpp"
+
 /// The energy of one contact: soft enough to be solved to rounding, stiff enough to be invisible.
 namespace diffsim {
 
@@ -12,7 +14,14 @@ struct PotentialValue {
 
 /// phi(p) = k/2 p² / (1 - p/P) for 0 < p < P, nothing for p <= 0, infinite from P on: the plain quadratic at
 /// ordinary loads, with a pole that no load gets through.
-PotentialValue contact_potential(double compression, double pole, double stiffness);
+inline PotentialValue contact_potential(double compression, double pole, double stiffness) {
+    if (!(compression > 0.0)) return {0.0, 0.0, 0.0};
+    const double ratio = compression / pole;
+    if (!(ratio < 1.0)) return {kInfinity, kInfinity, kInfinity};
+    const double growth = 1.0 / (1.0 - ratio);
+    const double linear = stiffness * compression * growth;
+    return {0.5 * linear * compression, linear * growth * (1.0 - 0.5 * ratio), stiffness * growth * growth * growth};
+}
 
 /// How far the rest distance of a contact with this pole has to be shifted, its pole staying where it is, for this force to
 /// act where the rest distance was.

@@ -43,7 +43,7 @@ SignedGap signed_gap(const Zone& zone, const ZoneContact& contact, const Contact
     const Vec3 offset = closest.point_a - closest.point_b;
     if (c.type == ContactType::edge_edge) {
         if (closest.slide_count_a == 1 && closest.slide_count_b == 1 && geometry.sine_sq >= kParallelLimit) {
-            result.normal = closest.slide_a[0].cross(closest.slide_b[0]).normalized();
+            result.normal = closest.edge_a.cross(closest.edge_b).normalized();
             const Vec3 open = outward(mesh_b, pose_b, c.feature_b, false) - outward(mesh_a, pose_a, c.feature_a, false);
             if (result.normal.dot(open) < 0.0) result.normal = -result.normal;
             result.valid = !open.isZero(0.0);

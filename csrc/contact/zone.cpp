@@ -4,7 +4,7 @@
 #include <cmath>
 #include <iterator>
 
-#include "math/positive_part.hpp"
+#include "contact/contact_assembly.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
@@ -17,173 +17,6 @@ struct Overloaded : Functions... {
 };
 template <class... Functions>
 Overloaded(Functions...) -> Overloaded<Functions...>;
-
-/// Take this share of its negative part off a Hessian.
-template <int N>
-void cut_off(CutShare cut, Square<N>& hessian) {
-    if (cut == kNothingCut) return;
-    const Square<N> part = positive_part<N>(hessian);
-    if (cut == kAllCut)
-        hessian = part;
-    else
-        hessian += cut * (part - hessian);
-}
-
-/// |L⁻¹ g| of one body.
-double scaled_norm(const ZoneBody& body, const Vec6& gradient) {
-    const Vec3 turn = gradient.head<3>();
-    return std::sqrt(turn.dot(body.inverse_inertia * turn) + gradient.tail<3>().squaredNorm() / body.mass);
-}
-
-/// Adds up the contacts' derivatives along the bodies' twists and the nodes.
-class Assembler {
-public:
-    Assembler(const Zone& zone, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives, BlockSystem* system)
-        : m_zone(zone), m_curvature(curvature), m_cut(cut), m_derivatives(derivatives), m_system(system) {}
-
-    void add(const ZonePoint& point, const ActiveContact& active) {
-        const ZoneContact& contact = m_zone.contacts[active.index];
-        if (contact.contact.with_ground()) {
-            if (contact.cloth_a >= 0)
-                add_node_on_ground(contact, active);
-            else
-                add_body_on_ground(point, contact, active);
-        } else if (contact.cloth_a >= 0) {
-            add_pair(contact, active, cloth_on(point, contact, active, true), cloth_on(point, contact, active, false));
-        } else if (contact.cloth_b >= 0) {
-            add_pair(contact, active, body_on(point, contact.a), cloth_on(point, contact, active, false));
-        } else {
-            add_pair(contact, active, body_on(point, contact.a), body_on(point, contact.b));
-        }
-    }
-
-private:
-    /// A side of a contact and where its derivatives go.
-    struct BodyPlace : BodySide {
-        int body;
-    };
-    struct ClothPlace : ClothSide {
-        std::array<int, 3> nodes;
-    };
-
-    static BodyPlace body_on(const ZonePoint& point, int body) { return {{point.poses[body].t}, body}; }
-    ClothPlace cloth_on(
-        const ZonePoint& point, const ZoneContact& contact, const ActiveContact& active, bool of_a) const {
-        const Surface surface = of_a ? surface_a(m_zone, contact, point.poses, point.nodes)
-                                     : surface_b(m_zone, contact, point.poses, point.nodes);
-        return {cloth_side(contact.contact, active.geometry, surface, of_a), feature_nodes(m_zone, contact, of_a)};
-    }
-
-    bool yields(const BodyPlace& place) const { return m_zone.yields(place.body); }
-    static bool yields(const ClothPlace&) { return true; }
-
-    void add_gradient(const BodyPlace& place, const Vec6& row, const Vec6& gradient, double force, double stiffness) {
-        m_derivatives.gradient.bodies[place.body] += gradient;
-        note_scale(scaled_norm(m_zone.bodies[place.body], row), force, stiffness);
-    }
-    void add_gradient(
-        const ClothPlace& place, const Vector<9>& row, const Vector<9>& gradient, double force, double stiffness) {
-        for (int k = 0; k < 3; ++k) {
-            const int node = place.nodes[k];
-            if (node < 0 || m_zone.nodes[node].pinned) continue;
-            m_derivatives.gradient.nodes[node] += gradient.segment<3>(3 * k);
-            note_scale(row.segment<3>(3 * k).norm() / std::sqrt(m_zone.nodes[node].mass), force, stiffness);
-        }
-    }
-    void note_scale(double scale, double force, double stiffness) {
-        m_derivatives.largest_force = std::max(m_derivatives.largest_force, force * scale);
-        m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, stiffness * scale);
-    }
-
-    template <class Block>
-    void add_block(const BodyPlace& place, const Block& block) {
-        m_system->diagonal(place.body) += block;
-    }
-    template <class Block>
-    void add_block(const ClothPlace& place, const Block& block) {
-        for (int r = 0; r < 3; ++r)
-            for (int c = r; c < 3; ++c)
-                if (place.nodes[r] >= 0 && place.nodes[c] >= 0)
-                    add_node_block(
-                        m_zone, place.nodes[r], place.nodes[c], block.template block<3, 3>(3 * r, 3 * c), *m_system);
-    }
-    template <class Block>
-    void add_cross(const ZoneContact& contact, const BodyPlace& a, const BodyPlace& b, const Block& block) {
-        if (a.body < b.body)
-            m_system->off_diagonal(contact.pair) += block;
-        else
-            m_system->off_diagonal(contact.pair) += block.transpose();
-    }
-    void add_cross(
-        const ZoneContact&, const BodyPlace& a, const ClothPlace& b, const Eigen::Matrix<double, 6, 9>& block) {
-        for (int k = 0; k < 3; ++k)
-            if (b.nodes[k] >= 0 && !m_zone.nodes[b.nodes[k]].pinned)
-                m_system->mixed_pair(m_system->find_mixed_pair(a.body, b.nodes[k])) += block.middleCols<3>(3 * k);
-    }
-    void add_cross(const ZoneContact&, const ClothPlace& a, const ClothPlace& b, const Square<9>& block) {
-        for (int r = 0; r < 3; ++r)
-            for (int c = 0; c < 3; ++c)
-                if (a.nodes[r] >= 0 && b.nodes[c] >= 0)
-                    add_node_block(m_zone, a.nodes[r], b.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
-    }
-
-    template <class A, class B>
-    void add_pair(const ZoneContact& contact, const ActiveContact& active, const A& a, const B& b) {
-        constexpr int kA = A::kSize, kB = B::kSize;
-        ContactDerivatives<kA + kB> d = contact_derivatives(
-            active.geometry, contact.range, contact.stiffness.value, base(a), base(b), m_system != nullptr,
-            m_curvature != Curvature::dropped);
-        if (yields(a)) add_gradient(a, d.row.template head<kA>(), d.gradient.template head<kA>(), d.force, d.stiffness);
-        if (yields(b)) add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
-        if (m_system == nullptr) return;
-        if (yields(a) && yields(b)) {
-            cut_off<kA + kB>(m_cut, d.hessian);
-            add_block(a, d.hessian.template topLeftCorner<kA, kA>());
-            add_block(b, d.hessian.template bottomRightCorner<kB, kB>());
-            add_cross(contact, a, b, d.hessian.template topRightCorner<kA, kB>());
-        } else if (yields(a)) {
-            Square<kA> hessian = d.hessian.template topLeftCorner<kA, kA>();
-            cut_off<kA>(m_cut, hessian);
-            add_block(a, hessian);
-        } else if (yields(b)) {
-            Square<kB> hessian = d.hessian.template bottomRightCorner<kB, kB>();
-            cut_off<kB>(m_cut, hessian);
-            add_block(b, hessian);
-        }
-    }
-
-    static const BodySide& base(const BodyPlace& place) { return place; }
-    static const ClothSide& base(const ClothPlace& place) { return place; }
-
-    void add_body_on_ground(const ZonePoint& point, const ZoneContact& contact, const ActiveContact& active) {
-        const Vec3 arm = active.geometry.closest.point_a - point.poses[contact.a].t;
-        GroundDerivatives d = ground_derivatives(
-            active.geometry.distance, arm, contact.range, contact.stiffness.value, m_system != nullptr,
-            m_curvature != Curvature::dropped);
-        const BodyPlace place{{point.poses[contact.a].t}, contact.a};
-        add_gradient(place, d.row, -d.force * d.row, d.force, d.stiffness);
-        if (m_system == nullptr) return;
-        cut_off<6>(m_cut, d.hessian);
-        add_block(place, d.hessian);
-    }
-
-    void add_node_on_ground(const ZoneContact& contact, const ActiveContact& active) {
-        const int node = feature_nodes(m_zone, contact, true)[0];
-        if (m_zone.nodes[node].pinned) return;
-        const PotentialValue potential = contact_potential(
-            contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
-            contact.stiffness.value);
-        m_derivatives.gradient.nodes[node].z() -= potential.force;
-        note_scale(1.0 / std::sqrt(m_zone.nodes[node].mass), potential.force, potential.stiffness);
-        if (m_system != nullptr) m_system->node_diagonal(node)(2, 2) += potential.stiffness;
-    }
-
-    const Zone& m_zone;
-    Curvature m_curvature;
-    CutShare m_cut;
-    ZoneDerivatives& m_derivatives;
-    BlockSystem* m_system;
-};
 
 void sort_unique(IndexPairs& pairs) {
     std::sort(pairs.begin(), pairs.end());
@@ -379,30 +212,42 @@ Surface placed_surface(const Zone& zone, const ZoneContact& contact, const ZoneP
 
 }  // namespace
 
-void evaluate(const Zone& zone, ZonePoint& point) {
-    place(zone, point.y, point.poses, point.nodes);
-    place_vertices(zone, point);
-    double inertial = 0.0;
+namespace {
+
+double inertial_energy(const Zone& zone, const Coordinates& y) {
+    double energy = 0.0;
     for (int i = 0; i < zone.dynamic_count; ++i) {
         const ZoneBody& body = zone.bodies[i];
-        const Vec6 error = point.y.bodies[i] - body.target;
-        inertial +=
+        const Vec6 error = y.bodies[i] - body.target;
+        energy +=
             0.5 * (error.head<3>().dot(body.inertia * error.head<3>()) + body.mass * error.tail<3>().squaredNorm());
     }
     for (int i = 0; i < zone.node_count(); ++i) {
         const ZoneNode& node = zone.nodes[i];
-        if (!node.pinned) inertial += 0.5 * node.mass * (point.y.nodes[i] - node.target).squaredNorm();
+        if (!node.pinned) energy += 0.5 * node.mass * (y.nodes[i] - node.target).squaredNorm();
     }
-    point.elastic_energy = 0.0;
-    if (zone.elastic) {
-        for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
-            const ZoneCloth& cloth = zone.cloths[c];
-            point.elastic_energy += zone.dt * zone.dt *
-                                    elastic_energy(
-                                        zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start,
-                                        point.nodes.data() + cloth.first_node);
-        }
+    return energy;
+}
+
+double elastic_energy(const Zone& zone, const std::vector<Vec3>& nodes) {
+    double energy = 0.0;
+    for (int c = 0; zone.elastic && c < static_cast<int>(zone.cloths.size()); ++c) {
+        const ZoneCloth& cloth = zone.cloths[c];
+        energy += zone.dt * zone.dt *
+                  elastic_energy(
+                      zone.cloth(c), (*zone.cloth_parameters)[cloth.id], zone.dt, cloth.start,
+                      nodes.data() + cloth.first_node);
     }
+    return energy;
+}
+
+}  // namespace
+
+void evaluate(const Zone& zone, ZonePoint& point) {
+    place(zone, point.y, point.poses, point.nodes);
+    place_vertices(zone, point);
+    const double inertial = inertial_energy(zone, point.y);
+    point.elastic_energy = elastic_energy(zone, point.nodes);
     point.distances.resize(zone.contacts.size());
     point.active.clear();
     point.contact_energy = 0.0;
@@ -523,6 +368,7 @@ void differentiate(
     const int count = zone.dynamic_count;
     derivatives.gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     derivatives.torque.resize(static_cast<std::size_t>(count));
+    derivatives.body_contacts.clear();
     derivatives.largest_force = derivatives.largest_stiffness = 0.0;
     if (curvature == Curvature::none) system = nullptr;
     if (system != nullptr) {
@@ -533,8 +379,7 @@ void differentiate(
         }
         system->set_zero();
     }
-    Assembler assembler(zone, curvature, cut, derivatives, system);
-    for (const ActiveContact& active : point.active) assembler.add(point, active);
+    add_contact_derivatives(zone, point, curvature, cut, derivatives, system);
 
     // From twists to coordinates. Bodies that have not turned and carry no torque need no change of chart.
     for (int i = 0; i < count; ++i) {

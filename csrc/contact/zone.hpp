@@ -177,8 +177,16 @@ enum class Curvature {
     dropped  ///< contacts are rows of constant direction (the paper's linearised constraint)
 };
 
+/// All contacts of two bodies, or of one and the ground.
+struct BodyContacts {
+    int a, b;
+    ContactStiffness stiffness;
+    Vector<12> gradient;  ///< along both twists
+};
+
 struct ZoneDerivatives {
-    Coordinates gradient;      ///< zero at pinned nodes
+    Coordinates gradient;  ///< zero at pinned nodes
+    std::vector<BodyContacts> body_contacts;
     std::vector<Vec3> torque;  ///< world-frame gradient with respect to turns, contacts only
     double largest_force;      ///< of a contact on a body, of all but inertia on a node, in units of |L⁻¹ g|, M = L Lᵀ
     double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|; of a node with the cloth's own

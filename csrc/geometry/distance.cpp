@@ -34,29 +34,30 @@ ClosestPoints closest_vertex_polygon(const Vec3& x, const PolygonView& polygon) 
     double best_sq = kInfinity;
     for (int k = 0; k < polygon.count; ++k) {
         const Vec3& p0 = polygon.vertices[k];
-        const Vec3& p1 = polygon.vertices[k + 1 < polygon.count ? k + 1 : 0];
+        const int next = k + 1 < polygon.count ? k + 1 : 0;
+        const Vec3& p1 = polygon.vertices[next];
         const Vec3 direction = p1 - p0;
         if (has_area && polygon.normal.dot(direction.cross(x - p0)) >= 0.0) continue;
         inside = false;
         const double length_sq = direction.squaredNorm();
         const double parameter = nearest_parameter(x, p0, direction, length_sq);
-        const Vec3 point = p0 + parameter * direction;
+        const Vec3 point = parameter < 1.0 ? Vec3(p0 + parameter * direction) : p1;
         const double distance_sq = (x - point).squaredNorm();
         if (distance_sq < best_sq) {
             best_sq = distance_sq;
             result.point_b = point;
             result.slide_count_b = is_interior(parameter) ? 1 : 0;
-            if (result.slide_count_b == 1) result.slide_b[0] = direction / std::sqrt(length_sq);
-            result.feature_code = 1u + 3u * static_cast<std::uint32_t>(k) + parameter_code(parameter);
+            result.edge_b = direction;
+            // A corner is where its edge begins, whichever of its two edges came first by rounding.
+            const bool at_end = parameter >= 1.0;
+            result.feature_code =
+                1u + 3u * static_cast<std::uint32_t>(at_end ? next : k) + (at_end ? 0u : parameter_code(parameter));
         }
     }
     if (inside) {
         const Vec3& n = polygon.normal;
         result.point_b = x - n * n.dot(x - polygon.vertices[0]);
         result.slide_count_b = 2;
-        const Vec3 helper = std::abs(n.x()) < 0.6 ? Vec3(Vec3::UnitX()) : Vec3(Vec3::UnitY());
-        result.slide_b[0] = n.cross(helper).normalized();
-        result.slide_b[1] = n.cross(result.slide_b[0]);
         result.feature_code = 0;
     }
     return result;
@@ -100,8 +101,8 @@ ClosestPoints closest_edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, 
     result.point_b = b0 + best_t * db;
     result.slide_count_a = is_interior(best_s) ? 1 : 0;
     result.slide_count_b = is_interior(best_t) ? 1 : 0;
-    if (result.slide_count_a == 1) result.slide_a[0] = da / std::sqrt(aa);
-    if (result.slide_count_b == 1) result.slide_b[0] = db / std::sqrt(bb);
+    result.edge_a = da;
+    result.edge_b = db;
     result.feature_code = 3u * parameter_code(best_s) + parameter_code(best_t);
     return result;
 }

@@ -14,8 +14,7 @@ struct ClosestPoints {
     Vec3 point_a, point_b;
     int slide_count_a = 0;  ///< 0 at a vertex, 1 on an edge, 2 inside a face
     int slide_count_b = 0;
-    std::array<Vec3, 2> slide_a;  ///< orthonormal directions, the first slide_count_a of them
-    std::array<Vec3, 2> slide_b;
+    Vec3 edge_a, edge_b;  ///< the edge from its first end to its second, where the count is 1, and of two edges always
     std::uint32_t feature_code = 0;  ///< tells the type and the sub-features apart, for signatures
 
     double distance() const { return (point_a - point_b).norm(); }

@@ -95,8 +95,9 @@ void RecordedZones::list_contacts(
             entry.shift = m_record.zones.hard[c].shift;
             entry.range.rest += entry.shift;
         }
-        if (zone.yields(entry.a) && zone.yields(entry.b))
-            zone.pairs.emplace_back(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
+        if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
+        const std::pair<int, int> pair(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
+        if (zone.pairs.empty() || zone.pairs.back() != pair) zone.pairs.push_back(pair);
     }
     std::sort(zone.pairs.begin(), zone.pairs.end());
     zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());

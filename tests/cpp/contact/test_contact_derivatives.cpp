@@ -233,12 +233,12 @@ TEST(a_cloth_side_holds_the_closest_point_and_how_it_slides) {
             CHECK_NEAR(nodes * side.weights, of_a ? g.closest.point_a : g.closest.point_b, 1e-12);
             for (int i = 0; i < slides; ++i) {
                 const Vec3& rate = side.slide[static_cast<std::size_t>(i)];
-                CHECK_NEAR(
-                    nodes * rate,
-                    of_a ? g.closest.slide_a[static_cast<std::size_t>(i)]
-                         : g.closest.slide_b[static_cast<std::size_t>(i)],
-                    1e-12);
+                const Vec3 slide = nodes * rate;
+                CHECK_NEAR(slide.norm(), 1.0, 1e-12);
+                CHECK_NEAR(slide.dot(g.normal), 0.0, 1e-9);
                 CHECK_NEAR(rate.sum(), 0.0, 1e-12);
+                for (int j = 0; j < i; ++j)
+                    CHECK_NEAR(slide.dot(nodes * side.slide[static_cast<std::size_t>(j)]), 0.0, 1e-12);
             }
             if (s.contact.type == ContactType::edge_edge)
                 CHECK_NEAR(side.edge_length, (nodes.col(1) - nodes.col(0)).norm(), 1e-15);
