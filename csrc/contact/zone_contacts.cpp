@@ -8,6 +8,7 @@
 namespace diffsim {
 namespace {
 
+constexpr double kRoom = 0.2;      // of the thickness: room on all sides of a body at rest
 constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
 
@@ -115,6 +116,16 @@ double contact_margins(const Model& model, const Contact& contact) {
 }
 
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
+    if (a.cloth < 0 && b.cloth < 0 && !zone.hard && !zone.contacts.empty()) {
+        // Of the same bodies as the last one: only the features differ.
+        const ZoneContact& last = zone.contacts.back();
+        if (last.contact.object_a == contact.object_a && last.contact.object_b == contact.object_b) {
+            ZoneContact entry = last;
+            entry.contact = contact;
+            append_contact(zone, entry);
+            return;
+        }
+    }
     ZoneContact entry;
     entry.contact = contact;
     entry.a = a.body;
@@ -198,7 +209,7 @@ private:
         const Vec6 change = m_end.bodies[i] - m_begin.bodies[i];
         const double radius = m_zone.mesh(i).radius;
         const bool yields = i < m_zone.dynamic_count;
-        const double slack = yields ? 0.5 * m_zone.model->thickness + kSidestep * motion_bound(change, radius) : 0.0;
+        const double slack = yields ? kRoom * m_zone.model->thickness + kSidestep * motion_bound(change, radius) : 0.0;
         if (yields) m_coverage.slack.push_back(slack);
         m_meshes.push_back(swept_mesh(m_zone, i, m_begin, m_end, slack + sagitta(change, radius)));
         m_boxes.push_back(swept_box(m_meshes.back()));

@@ -23,8 +23,10 @@ constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where 
 constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
 constexpr int kFutileSteps = 50;           // without a lower energy: there is none to be found
 constexpr int kMaxQpSteps = 6000;          // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
-constexpr int kStepsWithoutQp = 200;       // so many steps
+constexpr int kStepsWithoutQp = 1000;      // so many steps
 constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
+constexpr double kHeld = 0.1;              // of the way to its target: a body that moved less is held by something
+constexpr double kShortWay = 0.1;          // of a body's radius
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
@@ -63,7 +65,7 @@ private:
         m_zone.bodies.resize(count);  // those that do not yield join anew
         m_w.point.y.assign_zero(count, m_zone.nodes.size());
         m_w.y_end.resize(count, m_zone.nodes.size());
-        set_to_targets(m_w.y_end);
+        set_to_expected_ends(m_w.y_end);
         list_contacts(m_w.y_end);
         evaluate(m_zone, m_w.point);
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
@@ -85,6 +87,19 @@ private:
     void set_to_targets(Coordinates& y_end) const {
         for (std::size_t i = 0; i < y_end.bodies.size(); ++i) y_end.bodies[i] = m_zone.bodies[i].target;
         for (std::size_t i = 0; i < y_end.nodes.size(); ++i) y_end.nodes[i] = m_zone.nodes[i].target;
+    }
+
+    /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that reach
+    /// to their targets would be full of neighbours that they never meet.
+    void set_to_expected_ends(Coordinates& y_end) const {
+        set_to_targets(y_end);
+        for (std::size_t i = 0; i < y_end.bodies.size(); ++i) {
+            const ZoneBody& body = m_zone.bodies[i];
+            const double radius = m_zone.mesh(static_cast<int>(i)).radius;
+            const auto extent = [&](const Vec6& y) { return y.tail<3>().norm() + radius * y.head<3>().norm(); };
+            const double falling = extent(body.target);
+            if (falling < kShortWay * radius && extent(body.warm) < kHeld * falling) y_end.bodies[i] = body.warm;
+        }
     }
 
     /// List contacts for the way from the current point to y_end.
@@ -126,6 +141,7 @@ private:
         set_to_targets(m_w.y_end);
         const bool touching = !m_w.point.active.empty();
         if (touching && !may_pass(m_zone, m_w.y_end)) return false;
+        ensure_covered(m_w.y_end);
         if ((m_zone.dynamic_count > 0 || !m_zone.elastic) &&
             allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
             m_gates = find_impact_gates(m_zone, m_w.point, m_w.y_end);

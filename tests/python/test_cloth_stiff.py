@@ -122,6 +122,14 @@ def test_converges_where_nothing_but_elasticity_acts() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::diffsim.ConvergenceWarning")
+def test_a_sheet_that_shrinks_through_itself_converges() -> None:
+    """Into which folds is decided by rounding, and some are hard: the same sheet, nearly, several times."""
+    for k in range(8):
+        found = run("tripled", 1.0 + 1e-9 * k, 1e-2)
+        assert found.failed == 0, (k, found.failure)
+
+
+@pytest.mark.filterwarnings("ignore::diffsim.ConvergenceWarning")
 @pytest.mark.parametrize("stretch", [1e-3, 1e3])
 def test_absurd_bending_under_a_heavy_ball_ends(stretch: float) -> None:
     """Sheets that would rather do anything than bend: a step may fail, but says so in time."""
