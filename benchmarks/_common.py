@@ -113,8 +113,10 @@ class Table:
 
 
 def print_slopes(curves: Mapping[str, tuple[list[float], list[float]]]) -> None:
-    """A comment line with the log-log slope of each."""
-    print("# log-log slopes:", ", ".join(f"{name} {slope(x, y):.3f}" for name, (x, y) in curves.items()))
+    """A comment line with the log-log slope of each that has one."""
+    slopes = [f"{name} {slope(x, y):.3f}" for name, (x, y) in curves.items() if len(x) > 1]
+    if slopes:
+        print("# log-log slopes:", ", ".join(slopes))
 
 
 def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9.6, 4.6)) -> None:
@@ -180,8 +182,6 @@ def median_ratio(numerator: list[float], denominator: list[float]) -> float:
 
 def slope(x: list[float], y: list[float]) -> float:
     """Exponent p of the least-squares fit y ~ x^p."""
-    if len(x) < 2:
-        return float("nan")
     return statistics.linear_regression(*([math.log(v) for v in values] for values in (x, y))).slope
 
 

@@ -100,6 +100,8 @@ def _require_sheet(vertices: FloatArray, triangles: IntArray, where: str) -> Non
 def _pinned_nodes(pinned: Any, count: int, where: str) -> NDArray[np.uint8]:
     """A mask from indices, in any order and repeated or not, or from a mask."""
     mask = np.zeros(count, dtype=np.uint8)
+    if pinned is None:
+        return mask
     given = to_numpy(pinned, f"{where}: pinned")
     if given.size == 0 and given.dtype.kind != "b":  # an empty list has a dtype of its own
         return mask

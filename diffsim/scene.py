@@ -206,7 +206,7 @@ class Scene:
                 `trimesh.Trimesh`, or (vertices, faces) of shapes (n, 3) [m] and (m, 3).
             material: Default: `ClothMaterial()`, a plain cotton.
             pinned: Indices of nodes that move as told by `Control.node_velocity`, by default not at all; or one boolean
-                per node.
+                per node. None: no nodes.
             position: Origin of the mesh's frame, world, shape (3,) [m].
             orientation: Of the mesh's frame, quaternion w, x, y, z, shape (4,); normalised here.
             velocity: Of all nodes that are not pinned, world, shape (3,) [m/s].

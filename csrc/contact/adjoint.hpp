@@ -32,19 +32,6 @@ struct ZoneAdjoint {
     std::vector<ClothParameters> cloth_gradient;  ///< through elasticity, one per cloth of the zone
 };
 
-/// What dense and qr solve, (A + Jᵀ K J) z = v, over the free coordinates: six per dynamic body, three per node that is
-/// not pinned. The same as the KKT system of [Qiao et al. 2020, Eq. 9] with the compliance 1/K as its lower right block.
-struct LinearisedZone {
-    std::vector<int> bodies,
-        nodes;          ///< whose coordinates they are: indices into Model::bodies, cloth nodes of the scene
-    MatrixX inertia;    ///< A: inertia of bodies, inertia and elasticity of nodes, n x n
-    MatrixX J;          ///< the active contacts, m x n
-    VectorX stiffness;  ///< K of each contact, m [kg]
-};
-
-/// `zone` and `point` as for zone_adjoint.
-LinearisedZone linearise(const Zone& zone, const ZonePoint& point);
-
 /// Memory that adjoints reuse, their results included.
 struct AdjointWorkspace {
     BlockSystem system;

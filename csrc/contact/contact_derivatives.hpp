@@ -83,7 +83,7 @@ public:
     Mat6 hessian(bool with_curvature) const;
 
 private:
-    double m_force = 0.0, m_stiffness = 0.0;
+    double m_force = 0.0;
     Vec3 m_force_arm = Vec3::Zero();  // sum of force * arm
     Vec6 m_moments = Vec6::Zero();    // sums of stiffness * (1, x, y, xx, xy, yy), arm = (x, y, z)
 };

@@ -368,6 +368,7 @@ void differentiate(
     const int count = zone.dynamic_count;
     derivatives.gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     derivatives.torque.resize(static_cast<std::size_t>(count));
+    derivatives.jacobian.resize(static_cast<std::size_t>(count));
     derivatives.body_contacts.clear();
     derivatives.largest_force = derivatives.largest_stiffness = 0.0;
     if (curvature == Curvature::none) system = nullptr;
@@ -389,8 +390,10 @@ void differentiate(
         Vec6& gradient = derivatives.gradient.bodies[i];
         derivatives.torque[i] = gradient.head<3>();
         const bool turned = !y.head<3>().isZero(0.0);
+        Mat3& J = derivatives.jacobian[i];
+        J.setIdentity();
         if (turned) {
-            const Mat3 J = left_jacobian(y.head<3>());
+            J = left_jacobian(y.head<3>());
             gradient.head<3>() = J.transpose() * derivatives.torque[i];
             if (system != nullptr) {
                 Mat6& block = system->diagonal(i);
@@ -416,13 +419,12 @@ void differentiate(
     for (int k = 0; k < static_cast<int>(pattern.body_pairs.size()); ++k) {
         const auto [i, j] = pattern.body_pairs[k];
         Mat6& block = system->off_diagonal(k);
-        block.topRows<3>() = left_jacobian(point.y.bodies[i].head<3>()).transpose() * block.topRows<3>().eval();
-        block.leftCols<3>() = block.leftCols<3>().eval() * left_jacobian(point.y.bodies[j].head<3>());
+        block.topRows<3>() = derivatives.jacobian[i].transpose() * block.topRows<3>().eval();
+        block.leftCols<3>() = block.leftCols<3>().eval() * derivatives.jacobian[j];
     }
     for (int k = 0; k < static_cast<int>(pattern.mixed_pairs.size()); ++k) {
         Mat63& block = system->mixed_pair(k);
-        const Vec3 theta = point.y.bodies[pattern.mixed_pairs[k].first].head<3>();
-        block.topRows<3>() = left_jacobian(theta).transpose() * block.topRows<3>().eval();
+        block.topRows<3>() = derivatives.jacobian[pattern.mixed_pairs[k].first].transpose() * block.topRows<3>().eval();
     }
 }
 

@@ -187,7 +187,8 @@ struct BodyContacts {
 struct ZoneDerivatives {
     Coordinates gradient;  ///< zero at pinned nodes
     std::vector<BodyContacts> body_contacts;
-    std::vector<Vec3> torque;  ///< world-frame gradient with respect to turns, contacts only
+    std::vector<Vec3> torque;    ///< world-frame gradient with respect to turns, contacts only
+    std::vector<Mat3> jacobian;  ///< of the bodies' turns: d(turn)/d(theta)
     double largest_force;      ///< of a contact on a body, of all but inertia on a node, in units of |L⁻¹ g|, M = L Lᵀ
     double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|; of a node with the cloth's own
 };
@@ -203,7 +204,7 @@ void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSys
 
 /// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's base pattern, and is extended
 /// by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix. With all negative
-/// curvature cut off (CutShare), each contact's part is positive semidefinite as well.
+/// curvature cut off (CutShare), the contacts' part is positive semidefinite as well.
 void differentiate(
     const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
     CutShare cut = kNothingCut);

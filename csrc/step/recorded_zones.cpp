@@ -101,10 +101,12 @@ void RecordedZones::list_contacts(
     }
     std::sort(zone.pairs.begin(), zone.pairs.end());
     zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());
+    auto pair = zone.pairs.begin();
     for (ZoneContact& entry : zone.contacts) {
         if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
         const std::pair<int, int> key(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
-        entry.pair = static_cast<int>(std::lower_bound(zone.pairs.begin(), zone.pairs.end(), key) - zone.pairs.begin());
+        if (*pair != key) pair = std::lower_bound(zone.pairs.begin(), zone.pairs.end(), key);
+        entry.pair = static_cast<int>(pair - zone.pairs.begin());
     }
 }
 

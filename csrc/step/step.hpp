@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "contact/adjoint.hpp"
+#include "contact/linearised_zone.hpp"
 #include "contact/touching_zones.hpp"
 #include "contact/zone_solver.hpp"
 #include "model/state.hpp"

@@ -142,6 +142,11 @@ def test_pinned_nodes_by_index_or_mask(pinned: Any) -> None:
     np.testing.assert_array_equal(one_cloth(pinned=expected.astype(bool)).pinned, expected)
 
 
+@pytest.mark.parametrize("nothing", [None, (), []])
+def test_no_pinned_nodes(nothing: Any) -> None:
+    np.testing.assert_array_equal(one_cloth(pinned=nothing).pinned, 0)
+
+
 def test_vertices_of_a_mesh_keep_their_order(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     rng = np.random.default_rng(1)

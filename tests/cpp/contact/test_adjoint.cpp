@@ -1,4 +1,5 @@
 #include "contact/adjoint.hpp"
+#include "contact/linearised_zone.hpp"
 
 #include <Eigen/LU>
 
