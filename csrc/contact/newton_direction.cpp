@@ -29,6 +29,12 @@ bool solve(const BlockSystem& system, Coordinates& step) {
     return true;
 }
 
+bool has_driven_bodies(const Zone& zone) {
+    return std::any_of(zone.bodies.begin() + zone.dynamic_count, zone.bodies.end(), [](const ZoneBody& body) {
+        return !body.target.isZero(0.0);
+    });
+}
+
 /// Push every body in a direction of its own, that nothing but its id decides. Where the Hessian is indefinite the
 /// zone may be on a saddle of its energy. Rounding leads away from it, but where bodies stand in a regular pattern it
 /// does so at the pattern's ends only, and the others follow one by one.
@@ -63,13 +69,14 @@ bool NewtonDirection::repeat(
 }
 
 /// Where the exact Hessian is not positive definite, without the contacts' curvature: next to their stiffness and to the
-/// bodies' inertia its positive part is mostly nothing, and costs eigenvalues of every contact. But some heaps need it.
+/// bodies' inertia its positive part is mostly nothing, and costs eigenvalues of every pair. But some heaps need it, and
+/// bodies that are being pressed on.
 bool NewtonDirection::factorize_bodies(
     const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system) {
     differentiate(zone, point, Curvature::full, derivatives, &system);
     m_is_exact = m_has_factor = system.factorize();
     if (m_has_factor) return true;
-    if (m_indefinite++ < kMaxDropped)
+    if (!has_driven_bodies(zone) && m_indefinite++ < kMaxDropped)
         differentiate(zone, point, Curvature::dropped, derivatives, &system);
     else
         differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
