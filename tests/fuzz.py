@@ -132,7 +132,12 @@ def wrong_derivatives(sim: ds.Simulator, state: ds.State, control: ds.Control, s
     """How many derivatives of one step could be held against differences, and those that agree with none of them."""
     least: dict[int, tuple[float, str]] = {}  # per direction the smallest error over the step sizes
     for eps in DIFFERENCES:
-        report = ds.diagnostics.gradcheck(sim, state, control, directions=1, eps=eps, seed=seed)
+        try:
+            report = ds.diagnostics.gradcheck(sim, state, control, directions=1, eps=eps, seed=seed)
+        except ValueError as error:  # a contact under load has less room than eps
+            if "take a smaller eps" not in str(error):
+                raise
+            continue
         for k, found in enumerate(report.directions):
             if found.active_set_changed:
                 continue

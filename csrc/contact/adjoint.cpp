@@ -195,8 +195,7 @@ const ZoneAdjoint& zone_adjoint(
         }
         reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) { system.solve_in_place(z); });
     } else {
-        using Method = LinearisedSolver::Method;
-        const LinearisedSolver solver(zone, point, mode == AdjointMode::dense ? Method::dense : Method::qr);
+        const LinearisedSolver solver(zone, point, mode);
         reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) {
             KktSolution solution = solver.solve(z);
             z = std::move(solution.z);

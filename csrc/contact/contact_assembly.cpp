@@ -7,17 +7,6 @@
 
 namespace diffsim {
 
-template <int N>
-void cut_off(CutShare cut, Eigen::Matrix<double, N, N>& hessian) {
-    if (cut == kNothingCut) return;
-    const Eigen::Matrix<double, N, N> part = positive_part<N>(hessian);
-    if (cut == kAllCut)
-        hessian = part;
-    else
-        hessian += cut * (part - hessian);
-}
-template void cut_off<3>(CutShare, Mat3&);
-
 namespace {
 
 /// |L⁻¹ r|² of a body's part r of a row.
@@ -120,7 +109,7 @@ private:
         m_derivatives.body_contacts.push_back({m_a, m_b, *m_stiffness, gradient});
         if (m_system != nullptr) {
             Square<9> relative = m_half_hessian + m_half_hessian.transpose();
-            if (a_yields && b_yields) cut_off<9>(m_cut, relative);
+            if (a_yields && b_yields) cut_negative_part<9>(m_cut, relative);
             const Square<12> hessian = both_twists(relative);
             if (a_yields) add_diagonal(m_a, hessian.topLeftCorner<6, 6>(), a_yields && b_yields);
             if (b_yields) add_diagonal(m_b, hessian.bottomRightCorner<6, 6>(), a_yields && b_yields);
@@ -135,7 +124,7 @@ private:
     }
 
     void add_diagonal(int body, Mat6 block, bool is_cut) {
-        if (!is_cut) cut_off<6>(m_cut, block);
+        if (!is_cut) cut_negative_part<6>(m_cut, block);
         m_system->diagonal(body) += block;
     }
 
@@ -187,13 +176,13 @@ private:
         add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
         if (m_system == nullptr) return;
         if (yields(a)) {
-            cut_off<kA + kB>(m_cut, d.hessian);
+            cut_negative_part<kA + kB>(m_cut, d.hessian);
             add_block(a, d.hessian.template topLeftCorner<kA, kA>());
             add_block(b, d.hessian.template bottomRightCorner<kB, kB>());
             add_cross(a, b, d.hessian.template topRightCorner<kA, kB>());
         } else {
             Square<kB> hessian = d.hessian.template bottomRightCorner<kB, kB>();
-            cut_off<kB>(m_cut, hessian);
+            cut_negative_part<kB>(m_cut, hessian);
             add_block(b, hessian);
         }
     }
@@ -222,7 +211,7 @@ private:
         m_derivatives.body_contacts.push_back({m_on_ground, kGround, *m_ground_stiffness, gradient});
         if (m_system != nullptr) {
             Mat6 hessian = m_ground.hessian(m_with_curvature);
-            cut_off<6>(m_cut, hessian);
+            cut_negative_part<6>(m_cut, hessian);
             m_system->diagonal(m_on_ground) += hessian;
         }
         m_on_ground = kNobody;

@@ -74,7 +74,6 @@ public:
     ClothMotion(const ClothSide& side, const Vec3&) : m_side(side) {}
 
     Vector<9> row(const Vec3& n) const { return weighted(m_side.weights, n); }
-    Square<9> point_curvature(const Vec3&) const { return Square<9>::Zero(); }
     Vector<9> slide(int k, const Vec3&, const Vec3& n) const { return weighted(m_side.slide[k], n); }
     Rows3<9> direction(const Vec3& unit) const {
         const Mat3 projector = (Mat3::Identity() - unit * unit.transpose()) / m_side.edge_length;
@@ -140,8 +139,11 @@ void add_distance_hessian(
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
     const ClosestPoints& points = geometry.closest;
-    half.template topLeftCorner<A::kTurnSize, A::kTurnSize>() += (0.5 * factor) * a.point_curvature(n);
-    half.template block<B::kTurnSize, B::kTurnSize>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(n);
+    // Nodes move on straight lines: only points on bodies have a curvature of their own.
+    if constexpr (!std::is_same_v<A, ClothMotion>)
+        half.template topLeftCorner<3, 3>() += (0.5 * factor) * a.point_curvature(n);
+    if constexpr (!std::is_same_v<B, ClothMotion>)
+        half.template block<3, 3>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(n);
 
     const auto add_tangent = [&](const Vec3& tangent) {
         const Vector<kSize> row = relative_row(a, b, tangent);

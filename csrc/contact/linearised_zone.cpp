@@ -3,6 +3,7 @@
 #include <Eigen/Cholesky>
 #include <Eigen/LU>
 #include <Eigen/QR>
+#include <optional>
 
 #include "contact/contact_term.hpp"
 
@@ -208,29 +209,25 @@ LinearisedZone linearise(const Zone& zone, const ZonePoint& point) {
 
 struct LinearisedSolver::Parts {
     const Zone& zone;
-    Method method;
     FreeCoordinates free;
     Rows rows;
     MatrixX cloth;
-    InertiaFactor factor;  // qr's
+    std::optional<InertiaFactor> factor;  // for qr
 
-    Parts(const Zone& z, const ZonePoint& point, Method m)
-        : zone(z),
-          method(m),
-          free(z),
-          rows(collect_rows(z, point, free)),
-          cloth(cloth_matrix(z, point, free)),
-          factor(z, cloth) {}
+    Parts(const Zone& z, const ZonePoint& point)
+        : zone(z), free(z), rows(collect_rows(z, point, free)), cloth(cloth_matrix(z, point, free)) {}
 };
 
-LinearisedSolver::LinearisedSolver(const Zone& zone, const ZonePoint& point, Method method)
-    : m_parts(std::make_unique<Parts>(zone, point, method)) {}
+LinearisedSolver::LinearisedSolver(const Zone& zone, const ZonePoint& point, AdjointMode mode)
+    : m_parts(std::make_unique<Parts>(zone, point)) {
+    if (mode == AdjointMode::qr) m_parts->factor.emplace(zone, m_parts->cloth);
+}
 LinearisedSolver::~LinearisedSolver() = default;
 
 KktSolution LinearisedSolver::solve(const Coordinates& upstream) const {
     const Parts& p = *m_parts;
-    return p.method == Method::dense ? solve_dense(p.zone, p.free, p.cloth, p.rows, upstream)
-                                     : solve_qr(p.free, p.factor, p.rows, upstream);
+    return p.factor ? solve_qr(p.free, *p.factor, p.rows, upstream)
+                    : solve_dense(p.zone, p.free, p.cloth, p.rows, upstream);
 }
 
 }  // namespace diffsim

@@ -30,9 +30,8 @@ struct KktSolution {
 /// Solves it, for one zone at its solution.
 class LinearisedSolver {
 public:
-    enum class Method { dense, qr };
-
-    LinearisedSolver(const Zone& zone, const ZonePoint& point, Method method);
+    /// `mode`: dense or qr.
+    LinearisedSolver(const Zone& zone, const ZonePoint& point, AdjointMode mode);
     ~LinearisedSolver();
     KktSolution solve(const Coordinates& upstream) const;
 

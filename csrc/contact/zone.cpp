@@ -5,6 +5,7 @@
 #include <iterator>
 
 #include "contact/contact_assembly.hpp"
+#include "math/positive_part.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
@@ -407,7 +408,7 @@ void differentiate(
         Mat6& block = system->diagonal(i);
         if (turned && curvature != Curvature::dropped && !derivatives.torque[i].isZero(0.0)) {
             Mat3 extra = chart_curvature(y, derivatives.torque[i]);
-            cut_off<3>(cut, extra);
+            cut_negative_part<3>(cut, extra);
             block.topLeftCorner<3, 3>() += extra;
         }
         block.topLeftCorner<3, 3>() += body.inertia;

@@ -32,7 +32,6 @@ Eigen::Matrix<double, N, N> positive_part(const Eigen::Matrix<double, N, N>& sym
 template Eigen::Matrix<double, 3, 3> positive_part(const Eigen::Matrix<double, 3, 3>&);
 template Eigen::Matrix<double, 6, 6> positive_part(const Eigen::Matrix<double, 6, 6>&);
 template Eigen::Matrix<double, 9, 9> positive_part(const Eigen::Matrix<double, 9, 9>&);
-template Eigen::Matrix<double, 12, 12> positive_part(const Eigen::Matrix<double, 12, 12>&);
 template Eigen::Matrix<double, 15, 15> positive_part(const Eigen::Matrix<double, 15, 15>&);
 template Eigen::Matrix<double, 18, 18> positive_part(const Eigen::Matrix<double, 18, 18>&);
 

@@ -32,7 +32,6 @@ TEST(positive_part_keeps_positive_eigenvalues_and_drops_the_others) {
     check_size<3>();
     check_size<6>();
     check_size<9>();
-    check_size<12>();
     check_size<15>();
     check_size<18>();
 }
