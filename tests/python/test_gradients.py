@@ -83,6 +83,16 @@ def torus_on_sphere() -> ds.Scene:
     return scene
 
 
+def ball_between_balls() -> ds.Scene:
+    """A ball falls between two that are free, on the ground: one zone of three bodies and two pairs."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_sphere(0.2, density=700.0, position=(-0.22, 0.01, 0.201), name="left")
+    scene.add_sphere(0.25, density=900.0, position=(0.25, -0.02, 0.251), name="right")
+    scene.add_sphere(0.2, density=1100.0, position=(0.01, 0.02, 0.7), velocity=(0.0, 0.1, -1.0), name="top")
+    return scene
+
+
 def angle_on_box() -> ds.Scene:
     """A non-convex angle falls with its inner corner over the edge of a free box."""
     scene = ds.Scene()
@@ -110,6 +120,7 @@ SCENES: dict[str, Callable[[], ds.Scene]] = {
     "channel": lambda: dropped(ds.shapes.u_channel(0.8, 0.5, 0.6, 0.15), 0.75),
     "torus": lambda: dropped(ds.shapes.torus(0.4, 0.15, 10, 6), 0.65),
     "angle on box": angle_on_box,
+    "ball between balls": ball_between_balls,
     "torus on sphere": torus_on_sphere,
     "spheres": lambda: scenes.two_spheres(speed=2.0),
     "spheres on torus": spheres_on_fixed_mesh,
