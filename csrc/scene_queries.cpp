@@ -197,7 +197,7 @@ private:
         collect_feature_pairs(placed_a.swept(reach), placed_b.swept(reach), m_pairs);
         for (const FeaturePair& f : m_pairs) {
             const Contact contact{a, b, f.type, f.feature_a, f.feature_b};
-            consider(contact_geometry(contact, placed_a.surface(), placed_b.surface(), 0.0).distance - margins, a, b);
+            consider(ContactGeometry(contact, placed_a.surface(), placed_b.surface(), 0.0).distance - margins, a, b);
         }
     }
 
@@ -215,7 +215,7 @@ private:
         collect_self_pairs(placed.swept(reach), m_pairs);
         for (const FeaturePair& f : m_pairs) {
             const Contact contact{object, object, f.type, f.feature_a, f.feature_b};
-            const double distance = contact_geometry(contact, placed.surface(), placed.surface(), 0.0).distance;
+            const double distance = ContactGeometry(contact, placed.surface(), placed.surface(), 0.0).distance;
             if (distance < m_nearest.distance + 2.0 * cloth.margin)
                 consider(distance - contact_margins(m_model, contact), object, object);
         }

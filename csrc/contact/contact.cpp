@@ -52,37 +52,43 @@ ClosestPoints vertex_against_patch(const Surface& v, int vertex, const Surface& 
     return closest_vertex_polygon(v.vertex(vertex), {corners.data(), corners.count(), normal});
 }
 
-}  // namespace
+ClosestPoints vertex_above_ground(const Vec3& vertex, double ground_height) {
+    ClosestPoints points;
+    points.point_a = vertex;
+    points.point_b = Vec3(vertex.x(), vertex.y(), ground_height);
+    return points;
+}
 
-ContactGeometry contact_geometry(const Contact& contact, const Surface& a, const Surface& b, double ground_height) {
-    ContactGeometry geometry;
-    if (contact.with_ground()) {
-        ClosestPoints& points = geometry.closest;
-        points.point_a = a.vertex(contact.feature_a);
-        points.point_b = Vec3(points.point_a.x(), points.point_a.y(), ground_height);
-        geometry.distance = points.point_a.z() - ground_height;
-        geometry.normal = Vec3::UnitZ();
-        return geometry;
-    }
+ClosestPoints closest_points(const Contact& contact, const Surface& a, const Surface& b, double ground_height) {
+    if (contact.with_ground()) return vertex_above_ground(a.vertex(contact.feature_a), ground_height);
     switch (contact.type) {
         case ContactType::vertex_patch:
-            geometry.closest = vertex_against_patch(a, contact.feature_a, b, contact.feature_b);
-            break;
+            return vertex_against_patch(a, contact.feature_a, b, contact.feature_b);
         case ContactType::patch_vertex:
-            geometry.closest = swapped(vertex_against_patch(b, contact.feature_b, a, contact.feature_a));
+            return swapped(vertex_against_patch(b, contact.feature_b, a, contact.feature_a));
+        case ContactType::edge_edge:
             break;
-        case ContactType::edge_edge: {
-            const Ends ends_a(a, contact.feature_a), ends_b(b, contact.feature_b);
-            geometry.closest = closest_edge_edge(ends_a.x[0], ends_a.x[1], ends_b.x[0], ends_b.x[1]);
-            const Vec3 &da = geometry.closest.edge_a, &db = geometry.closest.edge_b;
-            geometry.sine_sq = da.cross(db).squaredNorm() / (da.squaredNorm() * db.squaredNorm());
-            break;
-        }
     }
-    const Vec3 offset = geometry.closest.point_a - geometry.closest.point_b;
-    geometry.distance = offset.norm();
-    geometry.normal = geometry.distance > 0.0 ? Vec3((1.0 / geometry.distance) * offset) : Vec3(Vec3::Zero());
-    return geometry;
+    const Ends ends_a(a, contact.feature_a), ends_b(b, contact.feature_b);
+    return closest_edge_edge(ends_a.x[0], ends_a.x[1], ends_b.x[0], ends_b.x[1]);
+}
+
+}  // namespace
+
+ContactGeometry::ContactGeometry(const Contact& contact, const Surface& a, const Surface& b, double ground_height)
+    : closest(closest_points(contact, a, b, ground_height)) {
+    if (contact.with_ground()) {
+        distance = closest.point_a.z() - ground_height;
+        normal = Vec3::UnitZ();
+        return;
+    }
+    const Vec3 offset = closest.point_a - closest.point_b;
+    distance = offset.norm();
+    normal = distance > 0.0 ? Vec3((1.0 / distance) * offset) : Vec3(Vec3::Zero());
+    if (contact.type == ContactType::edge_edge) {
+        const Vec3 &da = closest.edge_a, &db = closest.edge_b;
+        sine_sq = da.cross(db).squaredNorm() / (da.squaredNorm() * db.squaredNorm());
+    }
 }
 
 ContactGeometry contact_geometry(
@@ -90,7 +96,7 @@ ContactGeometry contact_geometry(
     const Surface a{&model.bodies[contact.object_a].mesh, &pose_a, nullptr};
     const Surface b =
         contact.with_ground() ? Surface{} : Surface{&model.bodies[contact.object_b].mesh, &pose_b, nullptr};
-    return contact_geometry(contact, a, b, ground_height);
+    return {contact, a, b, ground_height};
 }
 
 double contact_toi(

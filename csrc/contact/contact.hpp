@@ -37,18 +37,18 @@ struct Surface {
     Vec3 vertex(int v) const { return nodes != nullptr ? nodes[v] : *pose * mesh->vertices[v]; }
 };
 
+/// Distance and all that its derivatives need.
 struct ContactGeometry {
+    /// `ground_height` is the ground's in the frame of the surfaces; b is not used with the ground.
+    ContactGeometry(const Contact& contact, const Surface& a, const Surface& b, double ground_height);
+
+    ClosestPoints closest;  ///< in world axes
     double distance;        ///< between the bare meshes, margins not taken off [m]
     Vec3 normal;            ///< unit, from b to a
-    ClosestPoints closest;  ///< in world axes
     double sine_sq = 1.0;   ///< of the angle between two edges; 1 for other pairs
 };
 
-/// Distance and all that its derivatives need. `ground_height` is the ground's in the frame of the surfaces; b is not used
-/// with the ground.
-ContactGeometry contact_geometry(const Contact& contact, const Surface& a, const Surface& b, double ground_height);
-
-/// The same for two rigid bodies at these poses.
+/// The geometry of a contact of two rigid bodies at these poses.
 ContactGeometry contact_geometry(
     const Model& model, const Contact& contact, const Pose& pose_a, const Pose& pose_b, double ground_height);
 

@@ -135,9 +135,7 @@ ImpactDirection impact_direction(
         const ZoneContact& contact = zone.contacts[k];
         const double nearby = contact.range.rest + kNearby * (contact.range.rest - contact.range.floor);
         if (!(point.distances[k] < nearby)) continue;
-        const ContactGeometry geometry = contact_geometry(
-            contact.contact, surface_a(zone, contact, now.poses, now.nodes),
-            surface_b(zone, contact, now.poses, now.nodes), zone.ground_height);
+        const ContactGeometry geometry = contact_geometry(zone, contact, now.poses, now.nodes);
         if (geometry.sine_sq < kParallelLimit) continue;
         const bool pushes = geometry.distance < contact.range.rest;
         add(k, make_row(zone, contact, geometry, now, point.y, wanted_distance(contact, pushes)));
@@ -224,9 +222,7 @@ ImpactDirection impact_direction(
                     impact_at.poses[i] = pose_at(zone.bodies[i], impact_at.y.bodies[i]);
                 }
             }
-            const ContactGeometry geometry = contact_geometry(
-                contact.contact, surface_a(zone, contact, impact_at.poses, impact_at.nodes),
-                surface_b(zone, contact, impact_at.poses, impact_at.nodes), zone.ground_height);
+            const ContactGeometry geometry = contact_geometry(zone, contact, impact_at.poses, impact_at.nodes);
             if (!(geometry.distance > 0.0)) continue;
             if ((impact.toi > earliest || with_cloth(contact)) &&
                 !comes_from_outside(zone, contact, geometry, impact_at.poses))

@@ -94,9 +94,7 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
         result.lack = 0.0;
         for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
             const ZoneContact& contact = zone.contacts[k];
-            ContactGeometry geometry = contact_geometry(
-                contact.contact, surface_a(zone, contact, at.poses, at.nodes),
-                surface_b(zone, contact, at.poses, at.nodes), zone.ground_height);
+            ContactGeometry geometry = contact_geometry(zone, contact, at.poses, at.nodes);
             const double depth = contact.range.rest - contact.range.floor;
             if (!(geometry.distance < contact.range.rest - kAccepted * depth) || geometry.sine_sq == 0.0) continue;
             complete = false;

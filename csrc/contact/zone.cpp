@@ -130,8 +130,7 @@ void list_vertices(Zone& zone, int body, const Contact& contact, bool of_a) {
 
 }  // namespace
 
-void append_contact(Zone& zone, const ZoneContact& contact) {
-    zone.contacts.push_back(contact);
+void list_feature_vertices(Zone& zone, const ZoneContact& contact) {
     if (contact.contact.with_ground()) return;
     if (contact.cloth_a < 0) list_vertices(zone, contact.a, contact.contact, true);
     if (contact.cloth_b < 0) list_vertices(zone, contact.b, contact.contact, false);
@@ -152,6 +151,13 @@ Surface surface_b(
     return {&zone.mesh(contact.b), &poses[contact.b], nullptr};
 }
 
+ContactGeometry contact_geometry(
+    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes) {
+    return {
+        contact.contact, surface_a(zone, contact, poses, nodes), surface_b(zone, contact, poses, nodes),
+        zone.ground_height};
+}
+
 std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, bool of_a) {
     const int cloth = of_a ? contact.cloth_a : contact.cloth_b;
     std::array<int, 3> nodes = feature_vertices(zone.cloth(cloth).surface, contact.contact, of_a);
@@ -166,11 +172,7 @@ void rescue_contacts(Zone& zone) {
     for (const ZoneBody& body : zone.bodies) poses.push_back(body.start);
     for (const ZoneNode& node : zone.nodes) nodes.push_back(node.start);
     for (ZoneContact& contact : zone.contacts) {
-        const double distance = contact_geometry(
-                                    contact.contact, surface_a(zone, contact, poses, nodes),
-                                    surface_b(zone, contact, poses, nodes), zone.ground_height)
-                                    .distance;
-        contact.range = rescued_range(contact.range, distance);
+        contact.range = rescued_range(contact.range, contact_geometry(zone, contact, poses, nodes).distance);
     }
 }
 
@@ -265,12 +267,15 @@ void evaluate(const Zone& zone, ZonePoint& point) {
         const Surface a = body_on_ground ? surface_a(zone, contact, point.poses, point.nodes)
                                          : placed_surface(zone, contact, point, true);
         const Surface b = contact.contact.with_ground() ? Surface{} : placed_surface(zone, contact, point, false);
-        const ContactGeometry geometry = contact_geometry(contact.contact, a, b, zone.ground_height);
+        // Made where it stays if it is active.
+        const ContactGeometry& geometry =
+            point.active.emplace_back(static_cast<int>(k), contact.contact, a, b, zone.ground_height).geometry;
         point.distances[k] = geometry.distance;
         // Exactly parallel edges carry no energy and have no closest points: vertex-patch pairs act there.
-        if (!(geometry.distance < contact.range.rest) || geometry.sine_sq == 0.0) continue;
-        point.contact_energy += contact_energy(geometry, contact.range, contact.stiffness.value);
-        point.active.push_back({static_cast<int>(k), geometry});
+        if (geometry.distance < contact.range.rest && geometry.sine_sq != 0.0)
+            point.contact_energy += contact_energy(geometry, contact.range, contact.stiffness.value);
+        else
+            point.active.pop_back();
     }
     point.energy = inertial + point.elastic_energy + point.contact_energy;
 }

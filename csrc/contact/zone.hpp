@@ -117,8 +117,8 @@ struct Zone {
 /// Remove its contacts.
 void clear_contacts(Zone& zone);
 
-/// Append a contact, and the vertices of its bodies that it needs.
-void append_contact(Zone& zone, const ZoneContact& contact);
+/// Have the vertices of bodies that a contact needs placed with the zone.
+void list_feature_vertices(Zone& zone, const ZoneContact& contact);
 
 /// Compliance 0 asks for hard contacts.
 inline void set_compliance(Zone& zone, double compliance) {
@@ -139,6 +139,9 @@ void rescue_contacts(Zone& zone);
 
 /// A contact below its rest distance.
 struct ActiveContact {
+    ActiveContact(int k, const Contact& contact, const Surface& a, const Surface& b, double ground_height)
+        : index(k), geometry(contact, a, b, ground_height) {}
+
     int index;  ///< into Zone::contacts
     ContactGeometry geometry;
 };
@@ -165,6 +168,10 @@ void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std
 Surface surface_a(
     const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
 Surface surface_b(
+    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
+
+/// The geometry of a contact where bodies and nodes are at these places.
+ContactGeometry contact_geometry(
     const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
 
 /// The nodes of the zone that a contact's feature of a cloth has; -1 fills the rest.

@@ -112,17 +112,17 @@ double contact_margins(const Model& model, const Contact& contact) {
     if (contact.object_a != contact.object_b) return margins;
     const Cloth& cloth = model.cloth_of(contact.object_a);
     const Surface rest{&cloth.surface, nullptr, cloth.rest.data()};
-    return std::min(margins, 0.5 * contact_geometry(contact, rest, rest, 0.0).distance);
+    return std::min(margins, 0.5 * ContactGeometry(contact, rest, rest, 0.0).distance);
 }
 
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
     if (a.cloth < 0 && b.cloth < 0 && !zone.hard && !zone.contacts.empty()) {
         // Of the same bodies as the last one: only the features differ.
-        const ZoneContact& last = zone.contacts.back();
-        if (last.contact.object_a == contact.object_a && last.contact.object_b == contact.object_b) {
-            ZoneContact entry = last;
-            entry.contact = contact;
-            append_contact(zone, entry);
+        const Contact& last = zone.contacts.back().contact;
+        if (last.object_a == contact.object_a && last.object_b == contact.object_b) {
+            zone.contacts.push_back(zone.contacts.back());
+            zone.contacts.back().contact = contact;
+            list_feature_vertices(zone, zone.contacts.back());
             return;
         }
     }
@@ -139,7 +139,8 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
                           : b.body == kGround ? kInfinity
                                               : zone.bodies[b.body].mass;
     entry.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
-    append_contact(zone, entry);
+    zone.contacts.push_back(entry);
+    list_feature_vertices(zone, entry);
 }
 
 namespace {

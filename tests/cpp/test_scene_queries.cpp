@@ -68,7 +68,7 @@ NearestObjects brute_force(const Scene& scene) {
     };
     const auto consider = [&](const Contact& contact) {
         const Surface b = contact.with_ground() ? Surface{} : surface(contact.object_b);
-        const double bare = contact_geometry(contact, surface(contact.object_a), b, model.ground.height).distance;
+        const double bare = ContactGeometry(contact, surface(contact.object_a), b, model.ground.height).distance;
         const double distance = bare - contact_margins(model, contact);
         if (distance < nearest.distance) nearest = {distance, contact.object_a, contact.object_b};
     };

@@ -53,7 +53,7 @@ struct Situation {
         move_nodes(mesh_b, contact, false, x.tail<9>(), other.nodes_b);
         return other;
     }
-    ContactGeometry geometry() const { return contact_geometry(contact, surface_a(), surface_b(), 0.0); }
+    ContactGeometry geometry() const { return {contact, surface_a(), surface_b(), 0.0}; }
     double energy() const { return contact_energy(geometry(), range, kStiffness); }
     ClothSide side_a(const ContactGeometry& g) const { return cloth_side(contact, g, surface_a(), true); }
     ClothSide side_b(const ContactGeometry& g) const { return cloth_side(contact, g, surface_b(), false); }

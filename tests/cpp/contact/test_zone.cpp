@@ -41,7 +41,8 @@ void add_contact(Zone& zone, int a, int b, ContactType type, int feature_a, int 
         if (zone.pairs[k] == std::pair(std::min(a, b), std::max(a, b))) contact.pair = k;
     contact.range = contact_range(kThickness, kThickness);
     contact.stiffness = {10.0, 0.0, 0.0};
-    append_contact(zone, contact);
+    zone.contacts.push_back(contact);
+    list_feature_vertices(zone, contact);
 }
 
 /// Every pair of features of bodies of which one yields. The order of a and b alternates.

@@ -161,7 +161,7 @@ void for_each_contact(const Case& c, const Placed& placed, const Visit& visit) {
             const Surface& surface_of_b = placed.surfaces[b];
             fixtures::for_each_pair_of_features(
                 a, *surface_of_a.mesh, b, *surface_of_b.mesh, [&](const Contact& contact) {
-                    visit(contact, contact_geometry(contact, surface_of_a, surface_of_b, 0.0).distance);
+                    visit(contact, ContactGeometry(contact, surface_of_a, surface_of_b, 0.0).distance);
                 });
         }
     }
