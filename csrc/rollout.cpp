@@ -36,8 +36,10 @@ template <typename Work>
 void for_each_scene(const Model& model, int batch, int thread_count, const Work& work) {
     const bool one_by_one =
         batch < thread_count && (batch == 1 || model.body_count() + model.node_count() >= kBigScene);
-    Workers workers(one_by_one ? 1 : std::min(batch, thread_count));
-    std::vector<std::unique_ptr<StepWorkspace>> workspaces(static_cast<std::size_t>(workers.thread_count()));
+    const int scene_threads = one_by_one ? 1 : std::min(batch, thread_count);
+    // Each thread makes its own and gives it back; see StepWorkspace::memory.
+    std::vector<std::unique_ptr<StepWorkspace>> workspaces(static_cast<std::size_t>(scene_threads));
+    Workers workers(scene_threads, [&](int thread) { workspaces[thread].reset(); });
     workers.for_each_range(batch, 1, [&](int begin, int end, int thread) {
         std::unique_ptr<StepWorkspace>& workspace = workspaces[thread];
         if (!workspace) workspace = std::make_unique<StepWorkspace>(one_by_one ? thread_count : 1);

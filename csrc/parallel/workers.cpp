@@ -40,6 +40,7 @@ void Workers::serve(int thread) {
         run_ranges(thread);
         wait_until([this] { return any_unclaimed() || m_stopping; });
     }
+    if (m_at_end) m_at_end(thread);
 }
 
 void Workers::share(int count, int grain, const void* work, Call call) {

@@ -4,8 +4,10 @@
 #include <condition_variable>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <mutex>
 #include <thread>
+#include <utility>
 #include <vector>
 
 namespace diffsim {
@@ -16,7 +18,9 @@ namespace diffsim {
 /// sleep, and a loop never waits for one to wake up: whoever is awake takes the next range.
 class Workers {
 public:
-    explicit Workers(int thread_count) : m_thread_count(thread_count) {}
+    /// Each thread but the owner's calls `at_end` with its number before it ends.
+    explicit Workers(int thread_count, std::function<void(int thread)> at_end = nullptr)
+        : m_thread_count(thread_count), m_at_end(std::move(at_end)) {}
     ~Workers();
     Workers(const Workers&) = delete;
     Workers& operator=(const Workers&) = delete;
@@ -53,6 +57,7 @@ private:
     void wake();
 
     int m_thread_count;
+    std::function<void(int thread)> m_at_end;
     std::vector<std::thread> m_threads;
 
     // The loop at hand. Read by those alone who have claimed one of its ranges and not yet finished it.

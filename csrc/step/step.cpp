@@ -9,6 +9,7 @@
 
 #include "math/rotation.hpp"
 #include "step/object_groups.hpp"
+#include "step/thread_memory.hpp"
 
 namespace diffsim {
 namespace {
@@ -49,21 +50,6 @@ struct GroupOutcome {
     std::uint64_t signature = 0;
 };
 
-/// A kinematic body that did not reach its target.
-struct BlockedDrive {
-    int group;  ///< that was in its way
-    int body;
-    Vec6 reached;
-};
-
-/// What one thread collects of the groups it solves.
-struct alignas(64) GroupResults {   // of cache lines of its own
-    std::vector<Contact> contacts;  ///< active, group after group
-    std::vector<HardContact> hard;  ///< of theirs, if they are
-    std::vector<BlockedDrive> blocked;
-    std::vector<int> near;
-};
-
 }  // namespace
 
 struct StepWorkspace::ForwardScratch {
@@ -83,7 +69,6 @@ struct StepWorkspace::ForwardScratch {
     std::vector<int> movers;   ///< the objects that yield: the dynamic bodies and the cloths
     std::vector<Box> passive_boxes;
     std::vector<ObjectGroup> to_solve;
-    std::vector<GroupResults> results;  ///< one per thread
     std::vector<BlockedDrive> blocked;
     std::vector<ContactList> contact_lists;  ///< of the groups, by their smallest objects
     ZoneFinder zone_finder;
@@ -172,7 +157,7 @@ private:
         m.elastic_shift.resize(static_cast<std::size_t>(m_model.node_count()));
         const PassiveBodies nobody;
         for (int c = 0; c < m_model.cloth_count(); ++c) {
-            ZoneMemory& memory = m_workspace.zones[0];
+            ZoneMemory& memory = m_workspace.memory().zone;
             Zone& zone = new_zone(memory, origin_of(m_model.body_count() + c));
             zone.contacts_off = true;
             add_cloth(zone, c, m_state, m_control, m_parameters);
@@ -226,11 +211,7 @@ private:
         m.visited.resize(count);
         m.outcomes.assign(count, GroupOutcome{});
         m.dirty.assign(count, 1);
-        for (GroupResults& results : m.results) {
-            results.contacts.clear();
-            results.hard.clear();
-            results.blocked.clear();
-        }
+        m_workspace.for_each_memory([](ThreadMemory& memory) { memory.results.clear(); });
         m.groups.start(object_count(), m.movers);
         const int dynamic_count = static_cast<int>(m.dynamic.size());
         m_workspace.workers.for_each_range(dynamic_count, kBodiesARange, [&](int begin, int end, int) {
@@ -278,10 +259,11 @@ private:
             for (int k = begin; k < end; ++k) solve_group(m.to_solve[k], thread);
         });
         const auto gathered = static_cast<std::ptrdiff_t>(m.blocked.size());
-        for (GroupResults& results : m.results) {
-            m.blocked.insert(m.blocked.end(), results.blocked.begin(), results.blocked.end());
-            results.blocked.clear();
-        }
+        m_workspace.for_each_memory([&](ThreadMemory& memory) {
+            std::vector<BlockedDrive>& blocked = memory.results.blocked;
+            m.blocked.insert(m.blocked.end(), blocked.begin(), blocked.end());
+            blocked.clear();
+        });
         std::sort(m.blocked.begin() + gathered, m.blocked.end(), [](const BlockedDrive& a, const BlockedDrive& b) {
             return std::pair(a.group, a.body) < std::pair(b.group, b.body);
         });
@@ -290,15 +272,15 @@ private:
     void solve_group(const ObjectGroup& group, int thread) {
         const auto [root, first, end] = group;
         const std::vector<int>& members = m.groups.members();
-        GroupResults& results = m.results[thread];
+        ThreadMemory& own = m_workspace.memory(thread);
         GroupOutcome& outcome = m.outcomes[root];
         outcome = GroupOutcome{};
-        if (end - first == 1 && !m_model.is_cloth(root) && !meets_ground(root) && !meets_passive(root, results.near)) {
+        if (end - first == 1 && !m_model.is_cloth(root) && !meets_ground(root) && !meets_passive(root, own.near)) {
             m.y.bodies[root] = m.bodies[root].target;
             m.visited[root] = m.groups.space(root);
             return;
         }
-        ZoneMemory& memory = m_workspace.zones[thread];
+        ZoneMemory& memory = own.zone;
         Zone& zone = new_zone(memory, origin_of(root));
         for (int k = first; k < end; ++k) {  // sorted: bodies come before cloths
             if (m_model.is_cloth(members[k])) {
@@ -332,11 +314,11 @@ private:
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 m.y.nodes[m_model.cloths[cloth.id].first_node + k] = point.y.nodes[cloth.first_node + k];
         outcome.thread = thread;
-        keep_contacts(zone, point, outcome, results);
+        keep_contacts(zone, point, outcome, own.results);
         if (outcome.result.status == ZoneStatus::converged) return;
         for (int k = zone.dynamic_count; k < zone.body_count(); ++k)
             if (point.y.bodies[k] != zone.bodies[k].target)
-                results.blocked.push_back({root, zone.bodies[k].id, point.y.bodies[k]});
+                own.results.blocked.push_back({root, zone.bodies[k].id, point.y.bodies[k]});
     }
 
     static void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outcome, GroupResults& results) {
@@ -394,7 +376,7 @@ private:
         m.contact_lists.clear();
         for (int root : m.movers) {
             const GroupOutcome& outcome = m.outcomes[root];
-            const GroupResults& results = m.results[outcome.thread];
+            const GroupResults& results = m_workspace.memory(outcome.thread).results;
             const int first = outcome.first_contact;
             m.contact_lists.push_back(
                 {results.contacts.data() + first, results.hard.data() + first, outcome.contact_end - first});
@@ -488,12 +470,17 @@ private:
 }  // namespace
 
 StepWorkspace::StepWorkspace(int thread_count)
-    : workers(thread_count),
-      zones(static_cast<std::size_t>(thread_count)),
-      forward(std::make_unique<ForwardScratch>()) {
-    forward->results.resize(static_cast<std::size_t>(thread_count));
-}
+    : forward(std::make_unique<ForwardScratch>()),
+      m_memory(static_cast<std::size_t>(thread_count)),
+      workers(thread_count, [this](int thread) { m_memory[thread].reset(); }) {}
+
 StepWorkspace::~StepWorkspace() = default;
+
+ThreadMemory& StepWorkspace::memory(int thread) {
+    std::unique_ptr<ThreadMemory>& memory = m_memory[thread];
+    if (!memory) memory = std::make_unique<ThreadMemory>();
+    return *memory;
+}
 
 std::size_t StepRecord::bytes() const {
     return sizeof(*this) + start.bodies.capacity() * sizeof(BodyState) +

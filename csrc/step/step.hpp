@@ -47,12 +47,14 @@ class PenetratingStart : public std::invalid_argument {
     using std::invalid_argument::invalid_argument;
 };
 
-/// What one thread needs to solve a zone.
+/// What it takes to solve a zone.
 struct ZoneMemory {
     Zone zone;
     ZoneWorkspace workspace;
     std::vector<Box> visited;
 };
+
+struct ThreadMemory;
 
 /// Memory that steps reuse, and the threads among which a step divides its bodies and zones. No result depends on their
 /// number. Serves one step at a time.
@@ -60,13 +62,30 @@ class StepWorkspace {
 public:
     explicit StepWorkspace(int thread_count = 1);
     ~StepWorkspace();
+    StepWorkspace(const StepWorkspace&) = delete;
+    StepWorkspace& operator=(const StepWorkspace&) = delete;
 
-    Workers workers;
-    std::vector<ZoneMemory> zones;  ///< one per thread
+    /// A thread's own memory. The thread itself must be the first to ask for it: it is made there, and given back there
+    /// when the thread ends. An allocator hands out what a thread gives back to that thread again, so memory that another
+    /// one has given back lies among what that one writes to, and two threads wait for the same cache lines all the time.
+    ThreadMemory& memory(int thread = 0);
+    /// Call visit(memory) for the threads that have some.
+    template <class Visit>
+    void for_each_memory(const Visit& visit) {
+        for (const std::unique_ptr<ThreadMemory>& memory : m_memory)
+            if (memory) visit(*memory);
+    }
+
     struct ForwardScratch;
     std::unique_ptr<ForwardScratch> forward;
     struct BackwardScratch;
     std::shared_ptr<BackwardScratch> backward;  ///< made by the first backward
+
+private:
+    std::vector<std::unique_ptr<ThreadMemory>> m_memory;
+
+public:
+    Workers workers;  ///< the last member: its threads use the others as long as they run
 };
 
 /// From how many bodies on loops that do little for each are shared among threads, and in what portions.

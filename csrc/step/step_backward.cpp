@@ -5,6 +5,7 @@
 
 #include "math/rotation.hpp"
 #include "step/recorded_zones.hpp"
+#include "step/thread_memory.hpp"
 
 namespace diffsim {
 namespace {
@@ -12,27 +13,12 @@ namespace {
 constexpr int kWorthSharing = 64;       // bodies and nodes in zones: fewer are done before a thread has woken up
 constexpr int kPortionsPerThread = 32;  // of the zones: they take differently long
 
-/// What a zone gives a body that it shares with others.
-struct SharedGradient {
-    int zone, body;
-    Vec6 pose;
-};
-
-/// What one thread needs beside a zone's memory.
-struct alignas(64) BackwardLane {  // of cache lines of its own
-    std::vector<int> local;        ///< see RecordedZones::rebuild
-    Coordinates upstream;
-    AdjointWorkspace adjoint, elastic;  ///< of the zone; of split coupling's elastic pass
-    std::vector<SharedGradient> shared;
-};
-
 }  // namespace
 
 struct StepWorkspace::BackwardScratch {
     std::vector<Vec6> pose_gradient;  ///< along the twist of the body at the end of the step
     std::vector<Vec6> multiplier;
     std::vector<char> in_zone;
-    std::vector<BackwardLane> lanes;  ///< one per thread
     std::vector<SharedGradient> shared;
 };
 
@@ -94,10 +80,11 @@ private:
             for (int k = begin; k < end; ++k) solve_zone_adjoint(k, thread);
         });
         m.shared.clear();
-        for (BackwardLane& lane : m.lanes) {
-            m.shared.insert(m.shared.end(), lane.shared.begin(), lane.shared.end());
-            lane.shared.clear();
-        }
+        m_workspace.for_each_memory([&](ThreadMemory& memory) {
+            std::vector<SharedGradient>& shared = memory.backward.shared;
+            m.shared.insert(m.shared.end(), shared.begin(), shared.end());
+            shared.clear();
+        });
         std::sort(m.shared.begin(), m.shared.end(), [](const SharedGradient& a, const SharedGradient& b) {
             return std::pair(a.zone, a.body) < std::pair(b.zone, b.body);
         });
@@ -130,21 +117,22 @@ private:
     }
 
     void solve_zone_adjoint(int index, int thread) {
-        ZoneMemory& memory = m_workspace.zones[thread];
-        BackwardLane& lane = m.lanes[thread];
-        m_zones.rebuild(index, memory, lane.local);
+        ZoneMemory& memory = m_workspace.memory(thread).zone;
+        ZoneBackwardScratch& scratch = m_workspace.memory(thread).backward;
+        m_zones.rebuild(index, memory, scratch.local);
         const Zone& zone = memory.zone;
         const ZonePoint& point = memory.workspace.point;
-        lane.upstream.resize(0, 0);
-        for (int k = 0; k < zone.dynamic_count; ++k) lane.upstream.bodies.push_back(upstream(zone.bodies[k].id));
+        scratch.upstream.resize(0, 0);
+        for (int k = 0; k < zone.dynamic_count; ++k) scratch.upstream.bodies.push_back(upstream(zone.bodies[k].id));
         for (const ZoneCloth& cloth : zone.cloths)
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
-                lane.upstream.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
-        const ZoneAdjoint& adjoint = zone_adjoint(zone, point, lane.upstream, m_options.adjoint, m_needs, lane.adjoint);
+                scratch.upstream.nodes.push_back(node_upstream(m_model.cloths[cloth.id].first_node + k));
+        const ZoneAdjoint& adjoint =
+            zone_adjoint(zone, point, scratch.upstream, m_options.adjoint, m_needs, scratch.adjoint);
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
             if (k >= zone.dynamic_count) {
-                lane.shared.push_back({index, id, adjoint.place_gradient.bodies[k]});
+                scratch.shared.push_back({index, id, adjoint.place_gradient.bodies[k]});
                 continue;
             }
             m.pose_gradient[id] = adjoint.place_gradient.bodies[k];
@@ -153,7 +141,7 @@ private:
         }
         if (zone.cloths.empty()) return;
         if (m_options.split)
-            split_cloths(zone, adjoint, lane.elastic);
+            split_cloths(zone, adjoint, scratch.elastic);
         else
             finish_cloths(zone, adjoint);
     }
@@ -338,10 +326,7 @@ void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
-    if (!workspace.backward) {
-        workspace.backward = std::make_shared<StepWorkspace::BackwardScratch>();
-        workspace.backward->lanes.resize(workspace.zones.size());
-    }
+    if (!workspace.backward) workspace.backward = std::make_shared<StepWorkspace::BackwardScratch>();
     StepBackward(
         model, options, parameters, control, record, needs, workspace, gradient, control_gradient, parameter_gradient)
         .run();

@@ -65,6 +65,28 @@ TEST(workers_do_small_loops_on_the_owners_thread) {
     CHECK(id == std::this_thread::get_id());
 }
 
+TEST(workers_end_each_on_its_own_thread) {
+    std::thread::id worked, ended;
+    std::atomic<int> ends{0};
+    {
+        Workers workers(2, [&](int thread) {
+            CHECK(thread == 1);
+            ended = std::this_thread::get_id();
+            ++ends;
+        });
+        std::atomic<int> arrived{0};
+        workers.for_each_range(2, 1, [&](int, int, int thread) {
+            if (thread == 1) worked = std::this_thread::get_id();
+            ++arrived;
+            while (arrived < 2) std::this_thread::yield();
+        });
+        CHECK(ends == 0);
+    }
+    CHECK(ends == 1);
+    CHECK(ended == worked);
+    CHECK(ended != std::this_thread::get_id());
+}
+
 TEST(workers_throw_what_the_first_range_threw) {
     for (const int threads : {1, 3}) {
         Workers workers(threads);

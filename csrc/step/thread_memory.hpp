@@ -1,0 +1,52 @@
+#pragma once
+
+#include <vector>
+
+#include "contact/adjoint.hpp"
+#include "step/step.hpp"
+
+namespace diffsim {
+
+/// A kinematic body that did not reach its target.
+struct BlockedDrive {
+    int group;  ///< that was in its way
+    int body;
+    Vec6 reached;
+};
+
+/// What one thread collects of the groups it solves.
+struct GroupResults {
+    std::vector<Contact> contacts;  ///< active, group after group
+    std::vector<HardContact> hard;  ///< of theirs, if they are
+    std::vector<BlockedDrive> blocked;
+
+    void clear() {
+        contacts.clear();
+        hard.clear();
+        blocked.clear();
+    }
+};
+
+/// What a zone gives a body that it shares with others.
+struct SharedGradient {
+    int zone, body;
+    Vec6 pose;
+};
+
+/// What one thread needs for the backward of zones, beside the zone.
+struct ZoneBackwardScratch {
+    std::vector<int> local;  ///< see RecordedZones::rebuild
+    Coordinates upstream;
+    AdjointWorkspace adjoint, elastic;  ///< of the zone; of split coupling's elastic pass
+    std::vector<SharedGradient> shared;
+};
+
+/// What one thread of a step keeps to itself; see StepWorkspace::memory.
+struct ThreadMemory {
+    ZoneMemory zone;
+    GroupResults results;
+    std::vector<int> near;  ///< scratch
+    ZoneBackwardScratch backward;
+};
+
+}  // namespace diffsim
