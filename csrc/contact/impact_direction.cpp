@@ -187,7 +187,7 @@ ImpactDirection impact_direction(
             else
                 found->second = std::min(found->second, impact.toi);
         }
-        bool added = false;
+        bool violated = false;  // otherwise the QP's solution is the same again
         for (const Impact& impact : impacts) {
             const ZoneContact& contact = zone.contacts[impact.contact];
             const bool ground = contact.contact.with_ground();
@@ -230,9 +230,9 @@ ImpactDirection impact_direction(
             add(static_cast<std::size_t>(impact.contact),
                 make_row(zone, contact, geometry, impact_at, point.y, wanted_distance(contact, false)));
             listed[impact.contact] = 1;
-            added = true;
+            violated = violated || row_times(rows.back(), p) < rows.back().missing;
         }
-        if (!added) break;
+        if (!violated) break;
         newton_steps += solve();
     }
     best.newton_steps = newton_steps;

@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kMaxNewtonSteps = 50;
 constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
-constexpr double kQpTolerance = 1e-9;    // of the starting gradient, or of the forces: a search direction needs no more
+constexpr double kQpTolerance = 1e-9;    // of the largest forces: a search direction needs no more
 constexpr double kFullStep = 1e-3;       // steps this near to 1 end where the rows they were made for say
 // More forces at once would make a factor of their dense system dearer than one of the sparse one: by counting, n² nodes
 // and 10 n rows take about as many operations.
@@ -23,6 +23,8 @@ double dot(const Coordinates& a, const Coordinates& b, int body_count) {
     for (std::size_t i = 0; i < a.nodes.size(); ++i) sum += a.nodes[i].dot(b.nodes[i]);
     return sum;
 }
+
+double norm(const Coordinates& a, int body_count) { return std::sqrt(dot(a, a, body_count)); }
 
 /// The quadratic part of the QP times p; nothing for pinned nodes.
 void model_times(
@@ -93,11 +95,13 @@ int solve_impact_qp(
     gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     step = gradient;
     std::vector<double> violation(rows.size()), slope(rows.size());
-    double first_norm = -1.0;
+    const double model_norm = norm(model_gradient, count);
+    double largest = 0.0;  // of what cancels in the gradient
     int k = 0;
     for (; k < kMaxNewtonSteps; ++k) {
         system.set_zero();
         model_times(zone, mass_factor, cloth, p, gradient);
+        largest = std::max(largest, model_norm + norm(gradient, count));
         for (int i = 0; i < count; ++i) {
             const ZoneBody& body = zone.bodies[i];
             gradient.bodies[i] += model_gradient.bodies[i];
@@ -112,9 +116,9 @@ int solve_impact_qp(
             add_row(rows[r], -rows[r].stiffness * violation[r], gradient);
             add_row_stiffness(zone, rows[r], system);
         }
-        const double norm = std::sqrt(dot(gradient, gradient, count));
-        if (first_norm < 0.0) first_norm = norm;
-        if (!(norm > kQpTolerance * first_norm)) break;
+        const double left = norm(gradient, count);
+        largest = std::max(largest, left);
+        if (!(left > kQpTolerance * largest)) break;
         if (!system.factorize()) break;
         for (int i = 0; i < count; ++i) step.bodies[i] = -gradient.bodies[i];
         for (int i = 0; i < zone.node_count(); ++i) step.nodes[i] = -gradient.nodes[i];

@@ -11,7 +11,7 @@ using fixtures::random_direction;
 
 namespace {
 
-// The solver stops when the gradient has fallen to 1e-9 of where it began.
+// The solver stops when the gradient has fallen to 1e-9 of the largest forces.
 constexpr double kOptimality = 1.01e-9;
 
 struct Problem {
@@ -302,6 +302,23 @@ TEST(impact_qp_does_not_depend_on_the_start) {
         problem.solve(far);
         CHECK(flatten(near).norm() > 1e-3);
         CHECK_NEAR(flatten(far), flatten(near), 1e-5);  // 1e-9 of a gradient of about 1e6, over masses of about 1
+    }
+}
+
+TEST(impact_qp_takes_no_steps_from_its_solution) {
+    check::Random random(5);
+    for (const double stiffness : {10.0, 1e4, 1e7}) {
+        for (int k = 0; k < 20; ++k) {
+            NOTE(stiffness);
+            NOTE(k);
+            const Problem problem = random_problem(random, 4, 12, stiffness);
+            Coordinates p = fixtures::unflatten(VectorX::Zero(24));
+            CHECK(problem.solve(p) >= 1);
+            const VectorX found = flatten(p);
+            CHECK(active_rows(problem, found) >= 1);
+            CHECK(problem.solve(p) <= 1);
+            CHECK_NEAR(flatten(p), found, 1e-7 * found.norm());
+        }
     }
 }
 
