@@ -125,16 +125,22 @@ ImpactDirection impact_direction(
     }
 
     const Placement now{point.y, point.poses, point.nodes};
+    const auto is_near = [&](std::size_t k) {
+        const ContactRange& range = zone.contacts[k].range;
+        return point.distances[k] < range.rest + kNearby * (range.rest - range.floor);
+    };
     std::vector<ImpactRow> rows;
     std::vector<int> row_contacts;
+    std::size_t near_count = 0;
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k) near_count += is_near(k) ? 1 : 0;
+    rows.reserve(near_count);
     const auto add = [&](std::size_t k, const ImpactRow& row) {
         rows.push_back(row);
         row_contacts.push_back(static_cast<int>(k));
     };
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
+        if (!is_near(k)) continue;
         const ZoneContact& contact = zone.contacts[k];
-        const double nearby = contact.range.rest + kNearby * (contact.range.rest - contact.range.floor);
-        if (!(point.distances[k] < nearby)) continue;
         const ContactGeometry geometry = contact_geometry(zone, contact, now.poses, now.nodes);
         if (geometry.sine_sq < kParallelLimit) continue;
         const bool pushes = geometry.distance < contact.range.rest;

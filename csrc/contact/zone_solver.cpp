@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 #include "contact/hard_contacts.hpp"
 #include "contact/impact_gate.hpp"
@@ -19,6 +20,8 @@ constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its
 constexpr int kMaxHardRounds = 50;
 constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
 constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
+constexpr double kFarFromBalance = 0.1;    // residual above which it matters most which contacts push,
+constexpr double kNearBalance = 0.03;      // and below which it no longer does
 constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
 constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
 constexpr int kFutileSteps = 50;           // without a lower energy: there is none to be found
@@ -308,6 +311,7 @@ private:
         int futile = 0;  // steps since it fell by more than rounding may do
         for (;; ++m_result.iterations) {
             const bool driven = drives_done();
+            if (driven && m_result.iterations < m_options.max_iterations && take_qp_step()) continue;
             if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
                 return fail(ZoneStatus::no_descent);
             const Accuracy now = current_accuracy();
@@ -382,8 +386,8 @@ private:
         m_result.residual = current_accuracy().residual;
     }
 
-    /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
-    double past_impacts(double newton_limit, bool driven) {
+    /// Let m_w.y_end be where the QP of all nearby contacts leads.
+    ImpactDirection follow_impacts() {
         m_newton.lose_factor();  // the QP factorizes its own matrix
         Coordinates target = y();
         set_to_targets(target);
@@ -396,9 +400,15 @@ private:
             direction = impact_direction(m_zone, m_w.point, m_w.system, &direction);
             m_qp_steps += direction.newton_steps;
         }
-        const Coordinates newton_end = m_w.y_end;
         m_w.y_end = direction.y_end;
         m_w.y_end.bodies.resize(m_zone.bodies.size());
+        return direction;
+    }
+
+    /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
+    double past_impacts(double newton_limit, bool driven) {
+        const Coordinates newton_end = m_w.y_end;
+        const ImpactDirection direction = follow_impacts();
         const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
         if (good) return covered_step();
         m_w.y_end = newton_end;
@@ -406,6 +416,22 @@ private:
         for (std::size_t i = newton_end.bodies.size(); i < m_w.y_end.bodies.size(); ++i)
             m_w.y_end.bodies[i] = m_zone.bodies[i].target;
         return covered_step();
+    }
+
+    /// Where many contacts come and go, as when flat faces land on each other, a Newton step only tells which of them push
+    /// after it; the QP finds those that push together. So bodies that are far from balance go where the QP leads, and on
+    /// for as long as that takes them nearer fast. False, and nowhere gone, otherwise.
+    bool take_qp_step() {
+        const double before = m_result.residual;
+        const bool go_on = std::exchange(m_last_was_qp, false);
+        if (!m_zone.nodes.empty() || !(before > (go_on ? kNearBalance : kFarFromBalance))) return false;
+        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        const double now = m_result.residual = current_accuracy().residual;
+        if (!(now > kFarFromBalance || (go_on && now > kNearBalance && now < 0.5 * before))) return false;
+        follow_impacts();
+        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(covered_step())) return false;
+        accept_trial();
+        return m_last_was_qp = true;
     }
 
     /// The allowed step to m_w.y_end, with the list of contacts complete for it.
@@ -474,6 +500,7 @@ private:
     int m_qp_steps = 0;       // Newton steps of impact QPs so far
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
+    bool m_last_was_qp = false;              // of the steps so far
     bool m_rescue = false;                   // some objects start the step below their floor
     ZoneResult m_result;
 };

@@ -298,15 +298,17 @@ def test_absurd_speeds_are_answered(name: str) -> None:
 # ---- long use --------------------------------------------------------------------------------------------------------
 
 
-def test_a_long_row_leaves_its_saddle_at_once() -> None:
-    """A symmetric stack lands on a saddle of the energy. Its cubes leave it together, not one after the other."""
+def test_a_long_row_lands_in_few_newton_steps() -> None:
+    """A symmetric stack lands on a saddle of the energy: its cubes leave it together, not one after the other. Then a
+    dozen contacts of each pair come and go: the impact QP finds those that push, where Newton steps took 18.
+    """
     sim = ds.Simulator(scenes.two_layer_stack(150), dt=0.01, on_failure="raise")
     state, iterations = sim.initial_state(), []
     for _ in range(4):
         state = sim(state)
         assert sim.info is not None
         iterations.append(sim.info.iterations)
-    assert 10 < max(iterations) < 30, iterations
+    assert 6 <= max(iterations) <= 12, iterations
 
 
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
