@@ -10,7 +10,7 @@ namespace {
 
 constexpr int kMaxNewtonSteps = 50;
 constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
-constexpr double kQpTolerance = 1e-9;    // of the largest forces: a search direction needs no more
+constexpr double kQpTolerance = 1e-9;    // of the forces on each body: a search direction needs no more
 constexpr double kFullStep = 1e-3;       // steps this near to 1 end where the rows they were made for say
 // More forces at once would make a factor of their dense system dearer than one of the sparse one: by counting, n² nodes
 // and 10 n rows take about as many operations.
@@ -23,8 +23,6 @@ double dot(const Coordinates& a, const Coordinates& b, int body_count) {
     for (std::size_t i = 0; i < a.nodes.size(); ++i) sum += a.nodes[i].dot(b.nodes[i]);
     return sum;
 }
-
-double norm(const Coordinates& a, int body_count) { return std::sqrt(dot(a, a, body_count)); }
 
 /// The quadratic part of the QP times p; nothing for pinned nodes.
 void model_times(
@@ -85,6 +83,37 @@ void add_row_stiffness(const Zone& zone, const ImpactRow& row, BlockSystem& syst
     }
 }
 
+/// The forces that cancel on each body and node of a QP: sums of their sizes.
+class ForceSizes {
+public:
+    ForceSizes(int body_count, int node_count) : m_body_count(body_count) {
+        m_sizes.resize(static_cast<std::size_t>(body_count + node_count));
+    }
+    void start(const Coordinates& one, const Coordinates& other) {
+        for (std::size_t i = 0; i < m_sizes.size(); ++i) m_sizes[i] = part(one, i) + part(other, i);
+    }
+    void add(const ImpactRow& row, double force) {
+        if (row.a >= 0) m_sizes[row.a] += force * row.row_a.norm();
+        if (row.b >= 0) m_sizes[row.b] += force * row.row_b.norm();
+        for (int k = 0; k < row.node_count; ++k)
+            m_sizes[static_cast<std::size_t>(m_body_count + row.nodes[k])] += force * row.node_rows[k].norm();
+    }
+    bool balanced(const Coordinates& gradient) const {
+        for (std::size_t i = 0; i < m_sizes.size(); ++i)
+            if (!(part(gradient, i) <= kQpTolerance * m_sizes[i])) return false;
+        return true;
+    }
+
+private:
+    double part(const Coordinates& sum, std::size_t i) const {
+        const std::size_t bodies = static_cast<std::size_t>(m_body_count);
+        return i < bodies ? sum.bodies[i].norm() : sum.nodes[i - bodies].norm();
+    }
+
+    int m_body_count;
+    std::vector<double> m_sizes;
+};
+
 }  // namespace
 
 int solve_impact_qp(
@@ -95,13 +124,12 @@ int solve_impact_qp(
     gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
     step = gradient;
     std::vector<double> violation(rows.size()), slope(rows.size());
-    const double model_norm = norm(model_gradient, count);
-    double largest = 0.0;  // of what cancels in the gradient
+    ForceSizes sizes(count, zone.node_count());
     int k = 0;
     for (; k < kMaxNewtonSteps; ++k) {
         system.set_zero();
         model_times(zone, mass_factor, cloth, p, gradient);
-        largest = std::max(largest, model_norm + norm(gradient, count));
+        sizes.start(gradient, model_gradient);
         for (int i = 0; i < count; ++i) {
             const ZoneBody& body = zone.bodies[i];
             gradient.bodies[i] += model_gradient.bodies[i];
@@ -114,11 +142,10 @@ int solve_impact_qp(
             violation[r] = rows[r].missing - row_times(rows[r], p);
             if (!(violation[r] > 0.0)) continue;
             add_row(rows[r], -rows[r].stiffness * violation[r], gradient);
+            sizes.add(rows[r], rows[r].stiffness * violation[r]);
             add_row_stiffness(zone, rows[r], system);
         }
-        const double left = norm(gradient, count);
-        largest = std::max(largest, left);
-        if (!(left > kQpTolerance * largest)) break;
+        if (sizes.balanced(gradient)) break;
         if (!system.factorize()) break;
         for (int i = 0; i < count; ++i) step.bodies[i] = -gradient.bodies[i];
         for (int i = 0; i < zone.node_count(); ++i) step.nodes[i] = -gradient.nodes[i];

@@ -430,6 +430,7 @@ private:
         if (!(now > kFarFromBalance || (go_on && now > kNearBalance && now < 0.5 * before))) return false;
         follow_impacts();
         if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(covered_step())) return false;
+        if (!(m_w.trial.energy < m_w.point.energy - current_noise())) return false;  // forces are rounding
         accept_trial();
         return m_last_was_qp = true;
     }

@@ -11,7 +11,7 @@ using fixtures::random_direction;
 
 namespace {
 
-// The solver stops when the gradient has fallen to 1e-9 of the largest forces.
+// The solver stops when the gradient has fallen to 1e-9 of the forces on each body.
 constexpr double kOptimality = 1.01e-9;
 
 struct Problem {
