@@ -314,15 +314,10 @@ void drop_distant_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<Feat
 BoxTree refitted_tree(const SweptMesh& swept) {
     BoxTree tree = swept.mesh->tree;
     const SweptBoxes boxes(swept);
-    for (std::size_t k = tree.nodes.size(); k-- > 0;) {  // children follow their parents
-        BoxTree::Node& node = tree.nodes[k];
-        if (node.is_leaf()) {
-            node.box = patch_box(boxes, swept.mesh->cells[node.item].patch);
-        } else {
-            node.box = tree.nodes[node.left].box;
-            node.box.include(tree.nodes[node.right].box);
-        }
-    }
+    std::vector<Box> cells;
+    cells.reserve(swept.mesh->cells.size());
+    for (const auto& cell : swept.mesh->cells) cells.push_back(patch_box(boxes, cell.patch));
+    refit(tree, cells);
     return tree;
 }
 

@@ -29,75 +29,74 @@ void collect_overlaps(const BoxTree& tree, int a, int b, std::vector<std::pair<i
     }
 }
 
+/// Orders the nodes; boxes come after.
+class BoxTreeBuilder {
+public:
+    explicit BoxTreeBuilder(const std::vector<Box>& boxes) : m_order(boxes.size()) {
+        m_centers.reserve(boxes.size());
+        for (const Box& box : boxes) m_centers.push_back(box.center());
+        std::iota(m_order.begin(), m_order.end(), 0);
+        m_tree.nodes.resize(2 * boxes.size() - 1);
+        build(0, 0, static_cast<int>(boxes.size()));
+    }
+    BoxTree& tree() { return m_tree; }
+
+private:
+    /// A node over these places of m_order.
+    void build(int index, int begin, int end) {
+        BoxTree::Node& node = m_tree.nodes[index];
+        if (end - begin == 1) {
+            node.item = m_order[begin];
+            return;
+        }
+        split(begin, end);
+        const int middle = (begin + end) / 2;
+        // Children follow their parent, all on the left before those on the right.
+        node.left = index + 1;
+        node.right = index + 2 * (middle - begin);
+        build(node.left, begin, middle);
+        build(node.right, middle, end);
+    }
+
+    /// Sort the items into those of the left child and those of the right.
+    void split(int begin, int end) {
+        const auto order = m_order.begin();
+        Box spread;
+        for (int k = begin; k < end; ++k) spread.include(m_centers[m_order[k]]);
+        int axis;
+        (spread.upper - spread.lower).maxCoeff(&axis);
+        std::nth_element(order + begin, order + (begin + end) / 2, order + end, [&](int a, int b) {
+            return m_centers[a][axis] != m_centers[b][axis] ? m_centers[a][axis] < m_centers[b][axis] : a < b;
+        });
+    }
+
+    std::vector<Vec3> m_centers;
+    std::vector<int> m_order;
+    BoxTree m_tree;
+};
+
 }  // namespace
 
-BoxTreeBuilder::BoxTreeBuilder(const std::vector<Box>& boxes, int levels) : m_boxes(boxes), m_order(boxes.size()) {
-    if (boxes.empty()) return;
-    m_centers.reserve(boxes.size());
-    for (const Box& box : boxes) m_centers.push_back(box.center());
-    std::iota(m_order.begin(), m_order.end(), 0);
-    m_tree.nodes.resize(2 * boxes.size() - 1);
-    m_parts.push_back({0, 0, static_cast<int>(boxes.size())});
-    for (int level = 0; level < levels; ++level) {
-        std::vector<Part> parts;
-        for (const Part& part : m_parts) {
-            if (part.end - part.begin == 1) {
-                parts.push_back(part);
-                continue;
-            }
-            split(part);
-            m_top.push_back(part);
-            parts.push_back(part.left());
-            parts.push_back(part.right());
-        }
-        m_parts = std::move(parts);
-    }
-}
-
-void BoxTreeBuilder::build_part(int part) { build(m_parts[static_cast<std::size_t>(part)]); }
-
-BoxTree BoxTreeBuilder::finish() {
-    for (std::size_t k = m_top.size(); k-- > 0;) join(m_top[k]);
-    return std::move(m_tree);
-}
-
-/// Sort the items into those of the left child and those of the right.
-void BoxTreeBuilder::split(const Part& part) {
-    const auto order = m_order.begin();
-    Box spread;
-    for (int k = part.begin; k < part.end; ++k) spread.include(m_centers[m_order[k]]);
-    int axis;
-    (spread.upper - spread.lower).maxCoeff(&axis);
-    std::nth_element(order + part.begin, order + part.middle(), order + part.end, [&](int a, int b) {
-        return m_centers[a][axis] != m_centers[b][axis] ? m_centers[a][axis] < m_centers[b][axis] : a < b;
-    });
-}
-
-void BoxTreeBuilder::build(const Part& part) {
-    if (part.end - part.begin == 1) {
-        BoxTree::Node& leaf = m_tree.nodes[part.node];
-        leaf.item = m_order[part.begin];
-        leaf.box = m_boxes[leaf.item];
-        return;
-    }
-    split(part);
-    build(part.left());
-    build(part.right());
-    join(part);
-}
-
-void BoxTreeBuilder::join(const Part& part) {
-    BoxTree::Node& node = m_tree.nodes[part.node];
-    node.left = part.left().node;
-    node.right = part.right().node;
-    node.box = m_tree.nodes[node.left].box;
-    node.box.include(m_tree.nodes[node.right].box);
-}
-
 BoxTree build_box_tree(const std::vector<Box>& boxes) {
-    BoxTreeBuilder builder(boxes, 0);
-    for (int part = 0; part < builder.part_count(); ++part) builder.build_part(part);
-    return builder.finish();
+    if (boxes.empty()) return {};
+    BoxTreeBuilder builder(boxes);
+    refit(builder.tree(), boxes);
+    return std::move(builder.tree());
+}
+
+double refit(BoxTree& tree, const std::vector<Box>& boxes) {
+    double extents = 0.0;
+    for (std::size_t k = tree.nodes.size(); k-- > 0;) {  // children follow their parents
+        BoxTree::Node& node = tree.nodes[k];
+        if (node.is_leaf()) {
+            node.box = boxes[node.item];
+            continue;
+        }
+        node.box = tree.nodes[node.left].box;
+        node.box.include(tree.nodes[node.right].box);
+        extents += (node.box.upper - node.box.lower).sum();
+    }
+    return extents;
 }
 
 std::vector<std::pair<int, int>> overlapping_pairs(const BoxTree& tree) {

@@ -24,36 +24,9 @@ struct BoxTree {
 /// Median split on the longest side of the box around the items' centres. Depends on the boxes alone.
 BoxTree build_box_tree(const std::vector<Box>& boxes);
 
-/// Builds the same tree in parts, which different threads may build at the same time.
-class BoxTreeBuilder {
-public:
-    /// Splits the items into 2^levels parts, or fewer where they are too few. `boxes` must outlive it.
-    BoxTreeBuilder(const std::vector<Box>& boxes, int levels);
-
-    int part_count() const { return static_cast<int>(m_parts.size()); }
-    void build_part(int part);
-    /// The tree, once all parts are built.
-    BoxTree finish();
-
-private:
-    /// A node and the items below it, by their places in m_order.
-    struct Part {
-        int node, begin, end;
-        int middle() const { return (begin + end) / 2; }
-        // Children follow their parent, all on the left before those on the right.
-        Part left() const { return {node + 1, begin, middle()}; }
-        Part right() const { return {node + 2 * (middle() - begin), middle(), end}; }
-    };
-    void split(const Part& part);
-    void build(const Part& part);
-    void join(const Part& part);
-
-    const std::vector<Box>& m_boxes;
-    std::vector<Vec3> m_centers;
-    std::vector<int> m_order;
-    std::vector<Part> m_top, m_parts;  ///< the nodes above the parts, parents first
-    BoxTree m_tree;
-};
+/// Give the tree's items these boxes. Returns the sum of the extents of its inner nodes: what searching it costs grows
+/// with it when items move apart that the tree was built to keep together.
+double refit(BoxTree& tree, const std::vector<Box>& boxes);
 
 /// Pairs (i < j) of items whose boxes overlap, sorted.
 std::vector<std::pair<int, int>> overlapping_pairs(const BoxTree& tree);

@@ -3,13 +3,10 @@
 #include <cstddef>
 #include <numeric>
 
-#include "geometry/box_tree.hpp"
-
 namespace diffsim {
 namespace {
 
-constexpr std::size_t kWorthSharing = 128;  // boxes: a tree over fewer is done before a thread has woken up
-constexpr int kTreeLevels = 2;              // above the parts of a tree that threads share
+constexpr double kWorn = 1.5;  // times the extents that it was built with: a tree is built anew
 
 }  // namespace
 
@@ -23,21 +20,22 @@ void ObjectGroups::unite_all() {
     for (int i : m_movers) m_groups.unite(m_movers[0], i);
 }
 
-void ObjectGroups::unite_overlapping(Workers& workers) {
-    for (const auto& [a, b] : overlaps(workers)) m_groups.unite(m_movers[a], m_movers[b]);
+void ObjectGroups::unite_overlapping() {
+    for (const auto& [a, b] : overlaps()) m_groups.unite(m_movers[a], m_movers[b]);
 }
 
-std::vector<std::pair<int, int>> ObjectGroups::overlaps(Workers& workers) {
+std::vector<std::pair<int, int>> ObjectGroups::overlaps() {
     m_boxes.clear();
     for (int i : m_movers) m_boxes.push_back(m_space[i]);
-    BoxTreeBuilder builder(m_boxes, m_boxes.size() < kWorthSharing ? 0 : kTreeLevels);
-    workers.for_each_range(builder.part_count(), 1, [&](int begin, int end, int) {
-        for (int part = begin; part < end; ++part) builder.build_part(part);
-    });
-    return overlapping_pairs(builder.finish());
+    const bool fits = !m_boxes.empty() && m_tree.nodes.size() == 2 * m_boxes.size() - 1;
+    if (!fits || !(refit(m_tree, m_boxes) <= kWorn * m_built_extents)) {
+        m_tree = build_box_tree(m_boxes);
+        m_built_extents = refit(m_tree, m_boxes);
+    }
+    return overlapping_pairs(m_tree);
 }
 
-std::vector<std::pair<int, int>> ObjectGroups::include_visited(const std::vector<Box>& visited, Workers& workers) {
+std::vector<std::pair<int, int>> ObjectGroups::include_visited(const std::vector<Box>& visited) {
     bool left = false;
     for (int i : m_movers) {
         left = left || (visited[i].lower.array() < m_space[i].lower.array()).any() ||
@@ -46,7 +44,7 @@ std::vector<std::pair<int, int>> ObjectGroups::include_visited(const std::vector
     std::vector<std::pair<int, int>> joined;
     if (!left) return joined;
     for (int i : m_movers) m_space[i].include(visited[i]);
-    for (const auto& [a, b] : overlaps(workers)) {
+    for (const auto& [a, b] : overlaps()) {
         const int i = m_groups.find(m_movers[a]), j = m_groups.find(m_movers[b]);
         if (i == j) continue;
         m_groups.unite(i, j);

@@ -3,9 +3,8 @@
 #include <utility>
 #include <vector>
 
-#include "geometry/box.hpp"
+#include "geometry/box_tree.hpp"
 #include "math/union_find.hpp"
-#include "parallel/workers.hpp"
 
 namespace diffsim {
 
@@ -27,11 +26,11 @@ public:
     const Box& space(int object) const { return m_space[object]; }
 
     void unite_all();
-    void unite_overlapping(Workers& workers);
+    void unite_overlapping();
 
     /// Objects that were pushed out of their space may have met others: adds what they visited (of all objects) to it, and
     /// joins groups that overlap now. The joined pairs, by their roots before.
-    std::vector<std::pair<int, int>> include_visited(const std::vector<Box>& visited, Workers& workers);
+    std::vector<std::pair<int, int>> include_visited(const std::vector<Box>& visited);
 
     /// All groups by their roots, ascending. Valid until groups are united again.
     const std::vector<ObjectGroup>& sorted();
@@ -40,12 +39,14 @@ public:
 
 private:
     /// Pairs of places in m_movers.
-    std::vector<std::pair<int, int>> overlaps(Workers& workers);
+    std::vector<std::pair<int, int>> overlaps();
 
     std::vector<int> m_movers;
     std::vector<Box> m_space;  // of each object
     UnionFind m_groups;
-    std::vector<Box> m_boxes;            // scratch of overlaps()
+    std::vector<Box> m_boxes;            // of the movers, scratch of overlaps()
+    BoxTree m_tree;                      // over them; kept from step to step for as long as it serves
+    double m_built_extents = 0.0;        // of its inner nodes when it was built
     std::vector<int> m_members, m_next;  // sorted by group; scratch of sorted()
     std::vector<ObjectGroup> m_sorted;
 };

@@ -225,7 +225,7 @@ private:
         if (m_options.global_zone)
             m.groups.unite_all();
         else
-            m.groups.unite_overlapping(m_workspace.workers);
+            m.groups.unite_overlapping();
     }
 
     bool meets_ground(int i) const {
@@ -348,7 +348,7 @@ private:
     /// Groups whose objects were pushed to where they may have met others are to be solved again, together. False if there
     /// are none.
     bool merge_met_groups() {
-        const auto joined = m.groups.include_visited(m.visited, m_workspace.workers);
+        const auto joined = m.groups.include_visited(m.visited);
         for (const auto& [i, j] : joined) {
             m.outcomes[i] = m.outcomes[j] = GroupOutcome{};
             m.dirty[std::min(i, j)] = 1;
