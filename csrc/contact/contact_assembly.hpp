@@ -5,8 +5,9 @@
 namespace diffsim {
 
 /// Add the contacts' part of the energy's derivatives, along the bodies' twists and the nodes: gradient, largest force
-/// and stiffness, and, unless `system` is null, the Hessian, with so much of the negative curvature cut off: of all contacts
-/// of two bodies or of one with the ground together, of cloth contact by contact. `system` must have the pattern of these contacts.
+/// and stiffness, and, unless `system` is null, the Hessian, with so much of the negative curvature cut off: of all
+/// contacts of two bodies or of one with the ground together, of cloth contact by contact. `system` must have the pattern
+/// of these contacts.
 void add_contact_derivatives(
     const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives,
     BlockSystem* system);

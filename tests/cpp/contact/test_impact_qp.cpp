@@ -322,6 +322,26 @@ TEST(impact_qp_takes_no_steps_from_its_solution) {
     }
 }
 
+TEST(impact_qp_serves_light_bodies_beside_heavy_ones) {
+    constexpr double kHeavy = 1e10;
+    check::Random random(6);
+    for (int k = 0; k < 10; ++k) {
+        NOTE(k);
+        Problem problem = random_problem(random, 3, 10, 1e4);
+        Coordinates alone = fixtures::unflatten(VectorX::Zero(18)), beside = fixtures::unflatten(VectorX::Zero(24));
+        problem.solve(alone);
+        CHECK(active_rows(problem, flatten(alone)) >= 1);
+        // A heavy body that nothing touches, where it goes.
+        problem.zone.bodies.push_back(fixtures::zone_body(3, Pose(), kHeavy, kHeavy * Mat3::Identity()));
+        problem.zone.dynamic_count = 4;
+        problem.inertial_gradient.bodies.push_back(kHeavy * Vec6::Ones());
+        problem.mass_factor.push_back(1.0);
+        beside.bodies[3] = -Vec6::Ones();
+        problem.solve(beside);
+        CHECK_NEAR(VectorX(flatten(beside).head(18)), flatten(alone), 1e-7 * flatten(alone).norm());
+    }
+}
+
 TEST(without_rows_bodies_go_to_their_targets) {
     check::Random random(4);
     const Problem problem = random_problem(random, 2, 0, 1.0);
