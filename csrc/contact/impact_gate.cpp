@@ -18,6 +18,16 @@ Vec3 in_body(const Zone& zone, int body, const Vec6& y, const Vec3& point) {
     return pose.R.transpose() * (point - pose.t);
 }
 
+/// How far along a gate's normal its points and the bodies' centres are apart.
+struct Passage {
+    double points, centers;
+};
+
+Passage passage(const ImpactGate& gate, const Zone& zone, const Coordinates& y) {
+    const Pose a = pose_at(zone.bodies[gate.a], y.bodies[gate.a]), b = pose_at(zone.bodies[gate.b], y.bodies[gate.b]);
+    return {gate.normal.dot(a * gate.point_a - b * gate.point_b), gate.normal.dot(a.t - b.t)};
+}
+
 }  // namespace
 
 bool may_pass(const Zone& zone, const Coordinates& y_end) {
@@ -53,21 +63,25 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
         const Pose pose_a = pose_at(zone.bodies[a], y_a), pose_b = pose_at(zone.bodies[b], y_b);
         const ContactGeometry geometry =
             contact_geometry(*zone.model, contact.contact, pose_a, pose_b, zone.ground_height);
-        gates.push_back(
-            {a, b, in_body(zone, a, y_a, geometry.closest.point_a), in_body(zone, b, y_b, geometry.closest.point_b),
-             geometry.normal, contact.range.rest, geometry.normal.dot(pose_a.t - pose_b.t), passing,
-             travel > kFastPart * radius});
+        ImpactGate gate;
+        gate.a = a;
+        gate.b = b;
+        gate.point_a = in_body(zone, a, y_a, geometry.closest.point_a);
+        gate.point_b = in_body(zone, b, y_b, geometry.closest.point_b);
+        gate.normal = geometry.normal;
+        const Passage start = passage(gate, zone, point.y);
+        gate.least_points = std::min(start.points, contact.range.rest) - passing;
+        gate.least_centers = std::min(start.centers, geometry.normal.dot(pose_a.t - pose_b.t)) - 2.0 * passing;
+        gate.fast = travel > kFastPart * radius;
+        gates.push_back(gate);
     }
     return gates;
 }
 
 bool gates_hold(const std::vector<ImpactGate>& gates, const Zone& zone, const Coordinates& y) {
     return std::all_of(gates.begin(), gates.end(), [&](const ImpactGate& gate) {
-        const Pose a = pose_at(zone.bodies[gate.a], y.bodies[gate.a]),
-                   b = pose_at(zone.bodies[gate.b], y.bodies[gate.b]);
-        const double points = gate.normal.dot(a * gate.point_a - b * gate.point_b) - gate.rest;
-        const double centers = gate.normal.dot(a.t - b.t) - gate.centers;
-        return points >= -gate.allowed_passing && centers >= -2.0 * gate.allowed_passing;
+        const Passage now = passage(gate, zone, y);
+        return now.points >= gate.least_points && now.centers >= gate.least_centers;
     });
 }
 
