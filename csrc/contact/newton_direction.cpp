@@ -70,16 +70,24 @@ bool NewtonDirection::repeat(
 
 /// Where the exact Hessian is not positive definite, without the contacts' curvature: next to their stiffness and to the
 /// bodies' inertia its positive part is mostly nothing, and costs eigenvalues of every pair. But some heaps need it, and
-/// bodies that are being pressed on.
+/// bodies that are being pressed on. Where it is indefinite it mostly is so for some steps: every other one does not look.
 bool NewtonDirection::factorize_bodies(
     const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system) {
-    differentiate(zone, point, Curvature::full, derivatives, &system);
-    m_is_exact = m_has_factor = system.factorize();
-    if (m_has_factor) return true;
-    if (!has_driven_bodies(zone) && m_indefinite++ < kMaxDropped)
+    const bool may_drop = m_dropped < kMaxDropped && !has_driven_bodies(zone);
+    const bool try_exact = m_try_exact || !may_drop;
+    m_is_exact = m_has_factor = false;
+    if (try_exact) {
+        differentiate(zone, point, Curvature::full, derivatives, &system);
+        m_is_exact = m_has_factor = system.factorize();
+    }
+    m_try_exact = m_is_exact || !try_exact;
+    if (m_is_exact) return true;
+    if (may_drop) {
+        ++m_dropped;
         differentiate(zone, point, Curvature::dropped, derivatives, &system);
-    else
+    } else {
         differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
+    }
     m_has_factor = system.factorize();
     return m_has_factor;
 }

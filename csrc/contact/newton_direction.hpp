@@ -27,7 +27,8 @@ private:
         const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system);
 
     CutShare m_cut = kNothingCut;  // of the next step
-    int m_indefinite = 0;          // steps of bodies so far where the exact Hessian was
+    int m_dropped = 0;             // steps of bodies without curvature so far
+    bool m_try_exact = true;       // in the next step
     bool m_has_factor = false;
     bool m_is_exact = false;
 };
