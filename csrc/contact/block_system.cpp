@@ -133,11 +133,10 @@ void BlockSystem::solve_in_place(Coordinates& rhs) const {
     m_dense.triangularView<Eigen::Lower>().transpose().solveInPlace(x);
 }
 
-HalfSolution BlockSystem::half_solve(const int* nodes, const Vec3* values, int count) const {
-    std::vector<int> blocks(nodes, nodes + count);
-    for (int& block : blocks) block += m_pattern.body_count;
+HalfSolution BlockSystem::half_solve(std::vector<int> nodes, const std::vector<Vec3>& values) const {
+    for (int& node : nodes) node += m_pattern.body_count;
     HalfSolution result;
-    m_sparse->factor.half_solve(blocks, values->data(), result);
+    m_sparse->factor.half_solve(nodes, values.empty() ? nullptr : values[0].data(), result);
     return result;
 }
 

@@ -66,7 +66,7 @@ public:
     /// Overwrite the right-hand side by the solution. Needs a successful factorize().
     void solve_in_place(Coordinates& rhs) const;
     /// Half of the solution for a right-hand side that is zero but for these nodes. For systems with nodes.
-    HalfSolution half_solve(const int* nodes, const Vec3* values, int count) const;
+    HalfSolution half_solve(std::vector<int> nodes, const std::vector<Vec3>& values) const;
     /// out = matrix * in.
     void multiply(const Coordinates& in, Coordinates& out) const;
 

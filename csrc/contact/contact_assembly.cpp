@@ -81,7 +81,7 @@ private:
         if (contact.a != m_a || contact.b != m_b) begin_bodies(contact);
         const ContactForce<9> d = add_relative_derivatives(
             active.geometry, contact.range, contact.stiffness.value, BodySide{m_point.poses[m_a].t},
-            BodySide{m_point.poses[m_b].t}, m_with_curvature, m_system != nullptr ? &m_half_hessian : nullptr);
+            BodySide{m_point.poses[m_b].t}, m_with_curvature, m_system != nullptr ? &m_hessian : nullptr);
         m_gradient += d.gradient;
         const Vec3 shift = d.row.tail<3>();
         if (m_zone.yields(m_a))
@@ -97,7 +97,7 @@ private:
         m_pair = contact.pair;
         m_stiffness = &contact.stiffness;
         m_gradient.setZero();
-        m_half_hessian.setZero();
+        m_hessian.set_zero();
     }
 
     void end_bodies() {
@@ -108,7 +108,7 @@ private:
         if (b_yields) m_derivatives.gradient.bodies[m_b] += gradient.tail<6>();
         m_derivatives.body_contacts.push_back({m_a, m_b, *m_stiffness, gradient});
         if (m_system != nullptr) {
-            Square<9> relative = m_half_hessian + m_half_hessian.transpose();
+            Square<9> relative = m_hessian.whole();
             if (a_yields && b_yields) cut_negative_part<9>(m_cut, relative);
             const Square<12> hessian = both_twists(relative);
             if (a_yields) add_diagonal(m_a, hessian.topLeftCorner<6, 6>(), a_yields && b_yields);
@@ -237,7 +237,7 @@ private:
     double m_force_sq = 0.0, m_stiffness_sq = 0.0;  // largest so far
     int m_a = kNobody, m_b = kNobody, m_pair = -1;  // the two bodies at hand
     Vector<9> m_gradient;
-    Square<9> m_half_hessian;
+    HalfSymmetric<9> m_hessian;
     const ContactStiffness* m_stiffness = nullptr;
     int m_on_ground = kNobody;  // the body at hand there
     GroundContacts m_ground;

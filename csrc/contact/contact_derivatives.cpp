@@ -126,29 +126,25 @@ std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a)
     return {first, geometry.normal.cross(first)};
 }
 
-/// Hessians are added up as halves: what is meant is half + halfᵀ.
-///
 /// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|. With W = dw/dy,
 /// S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is orthogonal to S and n:
 ///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy²  =  WᵀNW/d - X - Xᵀ + n · d²w/dy²,  X = (SᵀW + ½ d q)ᵀ G q.
 /// A slide of one object changes its direction with the coordinates of that object alone.
 template <class A, class B>
 void add_distance_hessian(
-    const ContactGeometry& geometry, const A& a, const B& b, double factor, Square<A::kSize + B::kSize>& half) {
+    const ContactGeometry& geometry, const A& a, const B& b, double factor,
+    HalfSymmetric<A::kSize + B::kSize>& hessian) {
     constexpr int kSize = A::kSize + B::kSize;
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
     const ClosestPoints& points = geometry.closest;
     // Nodes move on straight lines: only points on bodies have a curvature of their own.
     if constexpr (!std::is_same_v<A, ClothMotion>)
-        half.template topLeftCorner<3, 3>() += (0.5 * factor) * a.point_curvature(n);
+        hessian.template block<3, 3>(0, 0) += (0.5 * factor) * a.point_curvature(n);
     if constexpr (!std::is_same_v<B, ClothMotion>)
-        half.template block<3, 3>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(n);
+        hessian.template block<3, 3>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(n);
 
-    const auto add_tangent = [&](const Vec3& tangent) {
-        const Vector<kSize> row = relative_row(a, b, tangent);
-        half.noalias() += ((0.5 * factor / d) * row) * row.transpose();
-    };
+    const auto add_tangent = [&](const Vec3& tangent) { hessian.add_square(factor / d, relative_row(a, b, tangent)); };
     const int count_a = points.slide_count_a, count = count_a + points.slide_count_b;
     if (count == 0) {
         const Vec3 tangent = n.unitOrthogonal();
@@ -186,9 +182,9 @@ void add_distance_hessian(
     for (int k = 0; k < count; ++k) {
         const Vector<kSize> PG = -factor * (G(0, k) * P[0] + G(1, k) * P[1]);
         if (k < count_a)
-            half.template leftCols<A::kTurnSize>().noalias() += PG * q_a[k].transpose();
+            hessian.template add_outer<0, A::kTurnSize>(PG, q_a[k]);
         else
-            half.template middleCols<B::kTurnSize>(A::kSize).noalias() += PG * q_b[k].transpose();
+            hessian.template add_outer<A::kSize, B::kTurnSize>(PG, q_b[k]);
     }
 }
 
@@ -216,19 +212,17 @@ struct Angle {
           gradient_a(turn_a.transpose() * direction_b),
           gradient_b(turn_b.transpose() * direction_a) {}
 
-    /// Add v dgᵀ.
-    template <class Half, class V>
-    void add_outer(const V& v, Half& half) const {
-        half.template leftCols<kA>().noalias() += v * gradient_a.transpose();
-        half.template middleCols<kB>(A::kSize).noalias() += v * gradient_b.transpose();
+    /// Add v dgᵀ and its transpose.
+    void add_outer(const Vector<A::kSize + B::kSize>& v, HalfSymmetric<A::kSize + B::kSize>& hessian) const {
+        hessian.template add_outer<0, kA>(v, gradient_a);
+        hessian.template add_outer<A::kSize, kB>(v, gradient_b);
     }
-    /// Add, times a factor, half of d²g.
-    template <class Half>
-    void add_hessian(double factor, Half& half) const {
-        half.template topLeftCorner<kA, kA>() += (0.5 * factor) * a.direction_curvature(direction_a, direction_b);
-        half.template block<kB, kB>(A::kSize, A::kSize) +=
+    /// Add, times a factor, d²g.
+    void add_hessian(double factor, HalfSymmetric<A::kSize + B::kSize>& hessian) const {
+        hessian.template block<kA, kA>(0, 0) += (0.5 * factor) * a.direction_curvature(direction_a, direction_b);
+        hessian.template block<kB, kB>(A::kSize, A::kSize) +=
             (0.5 * factor) * b.direction_curvature(direction_b, direction_a);
-        half.template block<kA, kB>(0, A::kSize).noalias() += factor * (turn_a.transpose() * turn_b);
+        hessian.template block<kA, kB>(0, A::kSize) += factor * (turn_a.transpose() * turn_b);
     }
 };
 
@@ -298,11 +292,11 @@ double contact_energy(const ContactGeometry& geometry, const ContactRange& range
 
 namespace {
 
-/// The second derivative is added to `half`, unless that is null.
+/// The second derivative is added to `hessian`, unless that is null.
 template <class A, class B>
 ContactForce<A::kSize + B::kSize> derivatives_along(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
-    bool with_curvature, Square<A::kSize + B::kSize>* half) {
+    bool with_curvature, HalfSymmetric<A::kSize + B::kSize>* hessian) {
     constexpr int kSize = A::kSize + B::kSize;
     ContactForce<kSize> result;
     result.row = relative_row(a, b, geometry.normal);
@@ -313,9 +307,9 @@ ContactForce<A::kSize + B::kSize> derivatives_along(
     result.force = mollifier.value * potential.force;
     result.stiffness = mollifier.value * potential.stiffness;
     result.gradient = -result.force * result.row;
-    if (half != nullptr) {
-        half->noalias() += ((0.5 * result.stiffness) * result.row) * result.row.transpose();
-        if (with_curvature && result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, *half);
+    if (hessian != nullptr) {
+        hessian->add_square(result.stiffness, result.row);
+        if (with_curvature && result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, *hessian);
     }
     if (!mollified) return result;
     // Mollifier mu(c), c = 1 - g², times potential: along dg, mu' = -2 g mu'(c) and mu'' = 4 g² mu''(c) - 2 mu'(c).
@@ -326,10 +320,10 @@ ContactForce<A::kSize + B::kSize> derivatives_along(
     gradient.template head<A::kTurnSize>() = angle.gradient_a;
     gradient.template segment<B::kTurnSize>(A::kSize) = angle.gradient_b;
     result.gradient += (potential.energy * first) * gradient;
-    if (half == nullptr || !with_curvature) return result;
+    if (hessian == nullptr || !with_curvature) return result;
     const Vector<kSize> along = (0.5 * potential.energy * second) * gradient - (potential.force * first) * result.row;
-    angle.add_outer(along, *half);
-    angle.add_hessian(potential.energy * first, *half);
+    angle.add_outer(along, *hessian);
+    angle.add_hessian(potential.energy * first, *hessian);
     return result;
 }
 
@@ -341,10 +335,10 @@ constexpr std::array<double, 4> kRelativeSign = {1.0, -1.0, 1.0, 1.0};
 
 ContactForce<9> add_relative_derivatives(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
-    bool with_curvature, Square<9>* half) {
+    bool with_curvature, HalfSymmetric<9>* hessian) {
     return derivatives_along(
         geometry, range, stiffness, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b),
-        with_curvature, half);
+        with_curvature, hessian);
 }
 
 Vector<12> both_twists(const Vector<9>& relative) {
@@ -368,21 +362,20 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     bool with_hessian, bool with_curvature) {
     ContactDerivatives<A::kSize + B::kSize> result;
     if constexpr (std::is_same_v<A, BodySide> && std::is_same_v<B, BodySide>) {
-        Square<9> half = Square<9>::Zero();
+        HalfSymmetric<9> hessian;
         const ContactForce<9> relative = add_relative_derivatives(
-            geometry, range, stiffness, side_a, side_b, with_curvature, with_hessian ? &half : nullptr);
+            geometry, range, stiffness, side_a, side_b, with_curvature, with_hessian ? &hessian : nullptr);
         result.force = relative.force;
         result.stiffness = relative.stiffness;
         result.gradient = both_twists(relative.gradient);
         result.row = both_twists(relative.row);
-        if (with_hessian) result.hessian = both_twists(Square<9>(half + half.transpose()));
+        if (with_hessian) result.hessian = both_twists(hessian.whole());
     } else {
-        using Hessian = Square<A::kSize + B::kSize>;
-        Hessian half = Hessian::Zero();
+        HalfSymmetric<A::kSize + B::kSize> hessian;
         static_cast<ContactForce<A::kSize + B::kSize>&>(result) = derivatives_along(
             geometry, range, stiffness, motion_of(side_a, geometry.closest.point_a),
-            motion_of(side_b, geometry.closest.point_b), with_curvature, with_hessian ? &half : nullptr);
-        if (with_hessian) result.hessian = half + half.transpose();
+            motion_of(side_b, geometry.closest.point_b), with_curvature, with_hessian ? &hessian : nullptr);
+        if (with_hessian) result.hessian = hessian.whole();
     }
     return result;
 }

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "contact/contact.hpp"
+#include "math/half_symmetric.hpp"
 
 /// Derivatives of a contact's energy.
 ///
@@ -26,11 +27,6 @@ struct ClothSide {
 
 /// What a cloth's feature contributes to a contact: where on it the closest point lies.
 ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, const Surface& cloth, bool of_a);
-
-template <int N>
-using Vector = Eigen::Matrix<double, N, 1>;
-template <int N>
-using Square = Eigen::Matrix<double, N, N>;
 
 /// The energy's first derivative along the coordinates of a and of b, and what it is made of.
 template <int N>
@@ -61,11 +57,11 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
     bool with_hessian, bool with_curvature);
 
-/// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. Unless `half` is null, adds
-/// to it a matrix that together with its transpose is the second derivative.
+/// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. The second derivative is
+/// added to `hessian`, unless that is null.
 ContactForce<9> add_relative_derivatives(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
-    bool with_curvature, Square<9>* half);
+    bool with_curvature, HalfSymmetric<9>* hessian);
 
 /// From there to the twists of a and of b.
 Vector<12> both_twists(const Vector<9>& relative);

@@ -68,19 +68,34 @@ void add_cloth_model(const Zone& zone, const BlockSystem& cloth, BlockSystem& sy
         system.node_pair(system.find_node_pair(pairs[k].first, pairs[k].second)) = cloth.node_pair(static_cast<int>(k));
 }
 
-void add_row_stiffness(const Zone& zone, const ImpactRow& row, BlockSystem& system) {
-    if (row.a >= 0) system.diagonal(row.a) += row.stiffness * row.row_a * row.row_a.transpose();
-    if (row.b >= 0) system.diagonal(row.b) += row.stiffness * row.row_b * row.row_b.transpose();
-    if (row.a >= 0 && row.b >= 0) system.off_diagonal(row.pair) += row.stiffness * row.row_a * row.row_b.transpose();
-    for (std::size_t k = 0; k < static_cast<std::size_t>(row.node_count); ++k) {
+/// The part of a row's stiffness that nodes take part in.
+void add_node_stiffness(const Zone& zone, const ImpactRow& row, BlockSystem& system) {
+    for (std::size_t k = 0; k < row.nodes.size(); ++k) {
         const int node = row.nodes[k];
-        for (std::size_t l = k; l < static_cast<std::size_t>(row.node_count); ++l)
+        for (std::size_t l = k; l < row.nodes.size(); ++l)
             add_node_block(
                 zone, node, row.nodes[l], row.stiffness * row.node_rows[k] * row.node_rows[l].transpose(), system);
         if (row.a >= 0)
             system.mixed_pair(system.find_mixed_pair(row.a, node)) +=
-                row.stiffness * row.row_a * row.node_rows[k].transpose();
+                row.stiffness * row.row_a() * row.node_rows[k].transpose();
     }
+}
+
+/// What the rows of two bodies do to them together.
+void add_run(
+    const ImpactRow& row, const Vector<9>& force, const Square<9>& stiffness, Coordinates& gradient,
+    BlockSystem& system) {
+    const Vector<12> forces = both_twists(force);
+    const Square<12> blocks = both_twists(stiffness);
+    if (row.a >= 0) {
+        gradient.bodies[row.a] -= forces.head<6>();
+        system.diagonal(row.a) += blocks.topLeftCorner<6, 6>();
+    }
+    if (row.b >= 0) {
+        gradient.bodies[row.b] -= forces.tail<6>();
+        system.diagonal(row.b) += blocks.bottomRightCorner<6, 6>();
+    }
+    if (row.a >= 0 && row.b >= 0) system.off_diagonal(row.pair) += blocks.topRightCorner<6, 6>();
 }
 
 /// The forces that cancel on each body and node of a QP: sums of their sizes.
@@ -93,9 +108,10 @@ public:
         for (std::size_t i = 0; i < m_sizes.size(); ++i) m_sizes[i] = part(one, i) + part(other, i);
     }
     void add(const ImpactRow& row, double force) {
-        if (row.a >= 0) m_sizes[row.a] += force * row.row_a.norm();
-        if (row.b >= 0) m_sizes[row.b] += force * row.row_b.norm();
-        for (int k = 0; k < row.node_count; ++k)
+        const double shift_sq = row.relative.tail<3>().squaredNorm();
+        if (row.a >= 0) m_sizes[row.a] += force * std::sqrt(row.relative.head<3>().squaredNorm() + shift_sq);
+        if (row.b >= 0) m_sizes[row.b] += force * std::sqrt(row.relative.segment<3>(3).squaredNorm() + shift_sq);
+        for (std::size_t k = 0; k < row.nodes.size(); ++k)
             m_sizes[static_cast<std::size_t>(m_body_count + row.nodes[k])] += force * row.node_rows[k].norm();
     }
     bool balanced(const Coordinates& gradient) const {
@@ -138,19 +154,30 @@ int solve_impact_qp(
         }
         for (int i = 0; i < zone.node_count(); ++i) gradient.nodes[i] += model_gradient.nodes[i];
         if (cloth != nullptr) add_cloth_model(zone, *cloth, system);
-        for (std::size_t r = 0; r < rows.size(); ++r) {
-            violation[r] = rows[r].missing - row_times(rows[r], p);
-            if (!(violation[r] > 0.0)) continue;
-            add_row(rows[r], -rows[r].stiffness * violation[r], gradient);
-            sizes.add(rows[r], rows[r].stiffness * violation[r]);
-            add_row_stiffness(zone, rows[r], system);
-        }
+        rows_times(rows, p, violation);
+        visit_runs(rows, [&](std::size_t first, std::size_t last) {
+            Vector<9> force = Vector<9>::Zero();
+            HalfSymmetric<9> stiffness;
+            for (std::size_t r = first; r < last; ++r) {
+                const ImpactRow& row = rows[r];
+                violation[r] = row.missing - violation[r];
+                if (!(violation[r] > 0.0)) continue;
+                const double push = row.stiffness * violation[r];
+                force += push * row.relative;
+                stiffness.add_square(row.stiffness, row.relative);
+                sizes.add(row, push);
+                for (std::size_t n = 0; n < row.nodes.size(); ++n)
+                    gradient.nodes[row.nodes[n]] -= push * row.node_rows[n];
+                add_node_stiffness(zone, row, system);
+            }
+            add_run(rows[first], force, stiffness.whole(), gradient, system);
+        });
         if (sizes.balanced(gradient)) break;
         if (!system.factorize()) break;
         for (int i = 0; i < count; ++i) step.bodies[i] = -gradient.bodies[i];
         for (int i = 0; i < zone.node_count(); ++i) step.nodes[i] = -gradient.nodes[i];
         system.solve_in_place(step);
-        for (std::size_t r = 0; r < rows.size(); ++r) slope[r] = row_times(rows[r], step);
+        rows_times(rows, step, slope);
         // Slope and curvature of the quadratic part along the step.
         model_times(zone, mass_factor, cloth, step, model_step);
         const double first = dot(step, model_gradient, count) + dot(model_step, p, count);
@@ -203,10 +230,10 @@ double ImpactForces::body_product(
         if (body < 0 || body != other) return;
         sum += row.dot(inverse_mass_times(m_zone.bodies[body], other_row)) / mass_factor[body];
     };
-    add(r.a, r.row_a, s.a, s.row_a);
-    add(r.a, r.row_a, s.b, s.row_b);
-    add(r.b, r.row_b, s.a, s.row_a);
-    add(r.b, r.row_b, s.b, s.row_b);
+    add(r.a, r.row_a(), s.a, s.row_a());
+    add(r.a, r.row_a(), s.b, s.row_b());
+    add(r.b, r.row_b(), s.a, s.row_a());
+    add(r.b, r.row_b(), s.b, s.row_b());
     return sum;
 }
 
@@ -215,8 +242,7 @@ double ImpactForces::node_product(const std::vector<ImpactRow>& rows, int r, int
     for (const int row : {r, s}) {
         if (m_slot[row] >= 0) continue;
         m_slot[row] = static_cast<int>(m_halves.size());
-        m_halves.push_back(
-            m_cloth.half_solve(rows[row].nodes.data(), rows[row].node_rows.data(), rows[row].node_count));
+        m_halves.push_back(m_cloth.half_solve(rows[row].nodes, rows[row].node_rows));
     }
     const int a = std::max(m_slot[r], m_slot[s]), b = std::min(m_slot[r], m_slot[s]);
     while (static_cast<int>(m_products.size()) <= a) m_products.emplace_back(m_products.size() + 1, kUnknown);

@@ -1,5 +1,7 @@
 #include "contact/impact_row.hpp"
 
+#include "math/rotation.hpp"
+
 namespace diffsim {
 
 ImpactRow make_row(
@@ -9,12 +11,13 @@ ImpactRow make_row(
     row.pair = contact.pair;
     row.stiffness = contact.stiffness.value;
     row.missing = wanted - geometry.distance;
-    const auto add_body = [&](int body, const Vec3& point, const Vec3& normal, int& slot, Vec6& out) {
-        Vec6 twist;
-        twist << (point - at.poses[body].t).cross(normal), normal;
+    row.relative.tail<3>() = -geometry.normal;
+    const auto add_body = [&](int body, const Vec3& point, const Vec3& normal, int& slot, int turn) {
         const Vec6& y = at.y.bodies[body];
-        out = chart_jacobian(y).transpose() * twist;
+        Vec6 out;
+        out << left_jacobian(y.head<3>()).transpose() * (point - at.poses[body].t).cross(normal), normal;
         if (zone.yields(body)) {
+            row.relative.segment<3>(turn) = out.head<3>();
             slot = body;
             row.missing += out.dot(y - y_now.bodies[body]);
         } else {
@@ -35,36 +38,60 @@ ImpactRow make_row(
                 continue;
             }
             row.missing += part.dot(at.y.nodes[node] - y_now.nodes[node]);
-            row.nodes[static_cast<std::size_t>(row.node_count)] = node;
-            row.node_rows[static_cast<std::size_t>(row.node_count)] = part;
-            ++row.node_count;
+            row.nodes.push_back(node);
+            row.node_rows.push_back(part);
         }
     };
     if (contact.cloth_a >= 0)
         add_cloth(true, geometry.normal);
     else
-        add_body(contact.a, geometry.closest.point_a, geometry.normal, row.a, row.row_a);
+        add_body(contact.a, geometry.closest.point_a, geometry.normal, row.a, 0);
     if (contact.contact.with_ground()) return row;
     if (contact.cloth_b >= 0)
         add_cloth(false, -geometry.normal);
     else
-        add_body(contact.b, geometry.closest.point_b, -geometry.normal, row.b, row.row_b);
+        add_body(contact.b, geometry.closest.point_b, -geometry.normal, row.b, 3);
     return row;
 }
 
-double row_times(const ImpactRow& row, const Coordinates& p) {
-    double sum =
-        (row.a >= 0 ? row.row_a.dot(p.bodies[row.a]) : 0.0) + (row.b >= 0 ? row.row_b.dot(p.bodies[row.b]) : 0.0);
-    for (std::size_t k = 0; k < static_cast<std::size_t>(row.node_count); ++k)
-        sum += row.node_rows[k].dot(p.nodes[row.nodes[k]]);
+namespace {
+
+/// What a row of these bodies is multiplied with.
+Vector<9> relative_motion(const ImpactRow& row, const Coordinates& p) {
+    Vector<9> motion = Vector<9>::Zero();
+    if (row.a >= 0) {
+        motion.head<3>() = p.bodies[row.a].head<3>();
+        motion.tail<3>() = -p.bodies[row.a].tail<3>();
+    }
+    if (row.b >= 0) {
+        motion.segment<3>(3) = p.bodies[row.b].head<3>();
+        motion.tail<3>() += p.bodies[row.b].tail<3>();
+    }
+    return motion;
+}
+
+double row_times(const ImpactRow& row, const Vector<9>& motion, const Coordinates& p) {
+    double sum = row.relative.dot(motion);
+    for (std::size_t k = 0; k < row.nodes.size(); ++k) sum += row.node_rows[k].dot(p.nodes[row.nodes[k]]);
     return sum;
 }
 
+}  // namespace
+
+double row_times(const ImpactRow& row, const Coordinates& p) { return row_times(row, relative_motion(row, p), p); }
+
+void rows_times(const std::vector<ImpactRow>& rows, const Coordinates& p, std::vector<double>& products) {
+    products.resize(rows.size());
+    visit_runs(rows, [&](std::size_t first, std::size_t last) {
+        const Vector<9> motion = relative_motion(rows[first], p);
+        for (std::size_t r = first; r < last; ++r) products[r] = row_times(rows[r], motion, p);
+    });
+}
+
 void add_row(const ImpactRow& row, double force, Coordinates& sum) {
-    if (row.a >= 0) sum.bodies[row.a] += force * row.row_a;
-    if (row.b >= 0) sum.bodies[row.b] += force * row.row_b;
-    for (std::size_t k = 0; k < static_cast<std::size_t>(row.node_count); ++k)
-        sum.nodes[row.nodes[k]] += force * row.node_rows[k];
+    if (row.a >= 0) sum.bodies[row.a] += force * row.row_a();
+    if (row.b >= 0) sum.bodies[row.b] += force * row.row_b();
+    for (std::size_t k = 0; k < row.nodes.size(); ++k) sum.nodes[row.nodes[k]] += force * row.node_rows[k];
 }
 
 }  // namespace diffsim

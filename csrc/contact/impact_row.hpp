@@ -1,6 +1,7 @@
 #pragma once
 
-#include "contact/zone_contacts.hpp"
+#include "contact/contact_derivatives.hpp"
+#include "contact/zone.hpp"
 
 namespace diffsim {
 
@@ -8,12 +9,15 @@ namespace diffsim {
 struct ImpactRow {
     int a = -1, b = -1;  ///< bodies of the zone; -1 where one does not yield or is none
     int pair = -1;       ///< block of the Hessian, or -1
-    Vec6 row_a = Vec6::Zero(), row_b = Vec6::Zero();
-    int node_count = 0;  ///< free nodes that take part
-    std::array<int, 6> nodes = {};
-    std::array<Vec3, 6> node_rows;
+    /// Along the coordinates of both bodies' turns, and the shift of b against a: see both_twists.
+    Vector<9> relative = Vector<9>::Zero();
+    std::vector<int> nodes;  ///< free nodes that take part
+    std::vector<Vec3> node_rows;
     double missing = 0.0;    ///< what p has to make up for: violated by max(0, missing - rowᵀ p) [m]
     double stiffness = 0.0;  ///< [kg]
+
+    Vec6 row_a() const { return both_twists(relative).head<6>(); }
+    Vec6 row_b() const { return both_twists(relative).tail<6>(); }
 };
 
 /// Everything at some coordinates.
@@ -32,7 +36,21 @@ ImpactRow make_row(
 /// rowᵀ p
 double row_times(const ImpactRow& row, const Coordinates& p);
 
+/// The same of all rows. Those of the same bodies should follow each other.
+void rows_times(const std::vector<ImpactRow>& rows, const Coordinates& p, std::vector<double>& products);
+
 /// sum += force * row
 void add_row(const ImpactRow& row, double force, Coordinates& sum);
+
+/// Call visit(first, last) with each run of rows, last one past its end, that are of the same bodies.
+template <class Visit>
+void visit_runs(const std::vector<ImpactRow>& rows, Visit&& visit) {
+    for (std::size_t first = 0; first < rows.size();) {
+        std::size_t last = first + 1;
+        while (last < rows.size() && rows[last].a == rows[first].a && rows[last].b == rows[first].b) ++last;
+        visit(first, last);
+        first = last;
+    }
+}
 
 }  // namespace diffsim

@@ -15,6 +15,10 @@ using Mat6 = Eigen::Matrix<double, 6, 6>;
 using Mat12 = Eigen::Matrix<double, 12, 12>;
 using VectorX = Eigen::VectorXd;
 using MatrixX = Eigen::MatrixXd;
+template <int N>
+using Vector = Eigen::Matrix<double, N, 1>;
+template <int N>
+using Square = Eigen::Matrix<double, N, N>;
 
 inline constexpr double kEpsilon = std::numeric_limits<double>::epsilon();
 inline constexpr double kInfinity = std::numeric_limits<double>::infinity();

@@ -37,10 +37,9 @@ struct Problem {
     }
     VectorX row(const ImpactRow& r) const {
         VectorX full = VectorX::Zero(size());
-        if (r.a >= 0) full.segment<6>(6 * r.a) = r.row_a;
-        if (r.b >= 0) full.segment<6>(6 * r.b) = r.row_b;
-        for (int k = 0; k < r.node_count; ++k)
-            full.segment<3>(node_row(r.nodes[static_cast<std::size_t>(k)])) = r.node_rows[static_cast<std::size_t>(k)];
+        if (r.a >= 0) full.segment<6>(6 * r.a) = r.row_a();
+        if (r.b >= 0) full.segment<6>(6 * r.b) = r.row_b();
+        for (std::size_t k = 0; k < r.nodes.size(); ++k) full.segment<3>(node_row(r.nodes[k])) = r.node_rows[k];
         return full;
     }
     VectorX gradient(const VectorX& p) const {
@@ -113,8 +112,7 @@ Problem random_problem(check::Random& random, int bodies, int row_count, double 
         const auto found = std::find(zone.pairs.begin(), zone.pairs.end(), std::pair(row.a, row.b));
         row.pair = found == zone.pairs.end() ? -1 : static_cast<int>(found - zone.pairs.begin());
         const Vec3 n = random_direction(random);
-        row.row_a << fixtures::random_vec3(random).cross(n), n;
-        row.row_b << fixtures::random_vec3(random).cross(-n), -n;
+        row.relative << fixtures::random_vec3(random), fixtures::random_vec3(random), -n;
         row.missing = random.uniform(-0.5, 0.5);
         row.stiffness = stiffness * random.uniform(0.5, 2.0);
         problem.rows.push_back(row);
@@ -150,17 +148,17 @@ Problem random_problem_with_nodes(check::Random& random, int bodies, int row_cou
         const Vec3 n = random_direction(random);
         if (sides == 1) {
             row.a = static_cast<int>(random.uniform(0.0, bodies));
-            row.row_a << fixtures::random_vec3(random).cross(n), n;
+            row.relative << fixtures::random_vec3(random), Vec3::Zero(), -n;
         }
         std::vector<int> order(kNodes - 1);
         for (int i = 1; i < kNodes; ++i) order[static_cast<std::size_t>(i - 1)] = i;
-        row.node_count = static_cast<int>(random.uniform(1.0, 3.0 * sides + 1.0));
-        for (std::size_t k = 0; k < static_cast<std::size_t>(row.node_count); ++k) {
+        const int node_count = static_cast<int>(random.uniform(1.0, 3.0 * sides + 1.0));
+        for (int k = 0; k < node_count; ++k) {
             const auto picked =
                 order.begin() + static_cast<int>(random.uniform(0.0, static_cast<double>(order.size())));
-            row.nodes[k] = *picked;  // in any order
+            row.nodes.push_back(*picked);  // in any order
             order.erase(picked);
-            row.node_rows[k] = random.uniform(-1.0, 1.0) * n;
+            row.node_rows.push_back(random.uniform(-1.0, 1.0) * n);
         }
         row.missing = random.uniform(-0.5, 0.5);
         row.stiffness = stiffness * random.uniform(0.5, 2.0);
@@ -360,7 +358,7 @@ TEST(a_row_that_wants_more_is_met_as_far_as_masses_and_stiffness_say) {
     problem.mass_factor = {1.0};
     ImpactRow row;
     row.a = 0;
-    row.row_a = Vec6::Unit(5);
+    row.relative = -Vector<9>::Unit(8);  // a's shift is the opposite of b's
     row.missing = 0.3;
     row.stiffness = 6.0;
     problem.rows.push_back(row);

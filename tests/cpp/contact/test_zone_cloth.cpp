@@ -322,8 +322,8 @@ TEST(impact_rows_are_the_gradients_of_distances) {
             if (active.geometry.sine_sq < kParallelLimit) continue;
             const ImpactRow row = make_row(zone, contact, active.geometry, at, y, kWanted);
             const auto along = [&](const Vec6& twist, const VectorX& nodes) {
-                double sum = row.a == 0 ? row.row_a.dot(twist) : row.b == 0 ? row.row_b.dot(twist) : 0.0;
-                for (std::size_t k = 0; k < static_cast<std::size_t>(row.node_count); ++k)
+                double sum = row.a == 0 ? row.row_a().dot(twist) : row.b == 0 ? row.row_b().dot(twist) : 0.0;
+                for (std::size_t k = 0; k < row.nodes.size(); ++k)
                     sum += row.node_rows[k].dot(nodes.segment<3>(3 * row.nodes[k]));
                 return sum;
             };
