@@ -25,7 +25,7 @@ double advance(const Closest& closest, const ClosingSpeed& closing_speed, const 
         const double speed = closing_speed(Vec3(offset / distance));
         // Aim half a tolerance above the minimum, so that rounding cannot carry us below it.
         const double room = distance - options.min_distance - 0.5 * options.tolerance;
-        if (speed * (1.0 - time) <= room) return kNoImpact;
+        if (speed * (options.until - time) <= room) return kNoImpact;
         time += room / speed;
     }
     return time;
@@ -68,7 +68,7 @@ double edge_edge_toi(
 double plane_toi(double distance0, double distance1, const CcdOptions& options) {
     if (!(distance0 > options.min_distance + options.tolerance)) return 0.0;
     const double room = distance0 - options.min_distance - 0.5 * options.tolerance;
-    return distance0 - distance1 <= room ? kNoImpact : room / (distance0 - distance1);
+    return options.until * (distance0 - distance1) <= room ? kNoImpact : room / (distance0 - distance1);
 }
 
 }  // namespace diffsim

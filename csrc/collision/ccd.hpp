@@ -14,11 +14,12 @@ struct CcdOptions {
     double min_distance = 0.0;  ///< distance to keep [m]
     double tolerance = 0.0;     ///< stop once within this of min_distance, from above [m]; must be positive
     int max_iterations = 1000;  ///< a time reached by then is still safe, only early
+    double until = 1.0;         ///< impacts at this time and later do not matter
 };
 
 inline constexpr double kNoImpact = kInfinity;
 
-/// A time in [0, 1] up to which the vertex, going from x0 to x1, stays at least min_distance away from the
+/// A time in [0, until) up to which the vertex, going from x0 to x1, stays at least min_distance away from the
 /// convex polygon going from p0 to p1, or kNoImpact if it does all the way. 0 where it starts too close.
 double vertex_polygon_toi(
     const Vec3& x0, const Vec3& x1, const Vec3* p0, const Vec3* p1, int count, const CcdOptions& options);

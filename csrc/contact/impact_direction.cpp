@@ -125,24 +125,28 @@ ImpactDirection impact_direction(
     }
 
     const Placement now{point.y, point.poses, point.nodes};
-    const auto is_near = [&](std::size_t k) {
+    const auto is_near = [&](std::size_t k, double distance) {
         const ContactRange& range = zone.contacts[k].range;
-        return point.distances[k] < range.rest + kNearby * (range.rest - range.floor);
+        return distance < range.rest + kNearby * (range.rest - range.floor);
     };
     std::vector<ImpactRow> rows;
     std::vector<int> row_contacts;
     std::size_t near_count = 0;
-    for (std::size_t k = 0; k < zone.contacts.size(); ++k) near_count += is_near(k) ? 1 : 0;
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k) near_count += is_near(k, point.distances[k]) ? 1 : 0;
     rows.reserve(near_count);
     const auto add = [&](std::size_t k, const ImpactRow& row) {
         rows.push_back(row);
         row_contacts.push_back(static_cast<int>(k));
     };
+    auto active = point.active.begin();  // in the order of the contacts
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
-        if (!is_near(k)) continue;
+        if (!is_near(k, point.distances[k])) continue;
         const ZoneContact& contact = zone.contacts[k];
-        const ContactGeometry geometry = contact_geometry(zone, contact, now.poses, now.nodes);
-        if (geometry.sine_sq < kParallelLimit) continue;
+        while (active != point.active.end() && active->index < static_cast<int>(k)) ++active;
+        const bool is_active = active != point.active.end() && active->index == static_cast<int>(k);
+        const ContactGeometry geometry =
+            is_active ? active->geometry : contact_geometry(zone, contact, now.poses, now.nodes);
+        if (!is_near(k, geometry.distance) || geometry.sine_sq < kParallelLimit) continue;
         const bool pushes = geometry.distance < contact.range.rest;
         add(k, make_row(zone, contact, geometry, now, point.y, wanted_distance(contact, pushes)));
     }

@@ -3,8 +3,10 @@
 #include <algorithm>
 #include <cmath>
 #include <iterator>
+#include <optional>
 
 #include "contact/contact_assembly.hpp"
+#include "contact/motion_bounds.hpp"
 #include "math/positive_part.hpp"
 #include "math/rotation.hpp"
 
@@ -246,7 +248,7 @@ double elastic_energy(const Zone& zone, const std::vector<Vec3>& nodes) {
 
 }  // namespace
 
-void evaluate(const Zone& zone, ZonePoint& point) {
+void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
     place(zone, point.y, point.poses, point.nodes);
     place_vertices(zone, point);
     const double inertial = inertial_energy(zone, point.y);
@@ -254,8 +256,17 @@ void evaluate(const Zone& zone, ZonePoint& point) {
     point.distances.resize(zone.contacts.size());
     point.active.clear();
     point.contact_energy = 0.0;
+    std::optional<MotionBounds> motion;
+    if (before != nullptr) motion.emplace(zone, before->y, point.y);
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
+        if (motion) {
+            const double at_least = before->distances[k] - motion->approach(contact);
+            if (at_least > contact.range.rest) {
+                point.distances[k] = at_least;
+                continue;
+            }
+        }
         const bool body_on_ground = contact.contact.with_ground() && contact.cloth_a < 0;
         if (body_on_ground) {
             const Pose& pose = point.poses[contact.a];

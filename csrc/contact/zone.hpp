@@ -152,14 +152,16 @@ struct ZonePoint {
     std::vector<Pose> poses;
     std::vector<Vec3> nodes;        ///< positions, zone frame
     std::vector<Vec3> vertices;     ///< of bodies, zone frame; those of Zone::feature_vertices
-    std::vector<double> distances;  ///< one per contact
+    std::vector<double> distances;  ///< one per contact, of active ones; what the others at least have
     std::vector<ActiveContact> active;
     double energy = 0.0;          ///< infinite at or below a pole
     double contact_energy = 0.0;  ///< the contacts' part
     double elastic_energy = 0.0;  ///< the cloths' part, dt² Ψ
 };
 
-void evaluate(const Zone& zone, ZonePoint& point);
+/// Find the rest of a point from its coordinates. `before`: a point that was evaluated with the same list of contacts, or
+/// null. Pairs that cannot have come near since then are left out, with what is known of their distances.
+void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before = nullptr);
 
 /// Where bodies and nodes are at these coordinates.
 void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std::vector<Vec3>& nodes);

@@ -4,18 +4,14 @@
 #include <cmath>
 
 #include "collision/ccd.hpp"
+#include "contact/motion_bounds.hpp"
 
 namespace diffsim {
 namespace {
 
-constexpr double kRoom = 0.2;      // of the thickness: room on all sides of a body at rest
+constexpr double kRoom = 0.05;     // of the thickness: room on all sides of a body at rest
 constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
-
-/// Bound on how far any vertex moves when the coordinates change by this much.
-double motion_bound(const Vec6& change, double radius) {
-    return change.tail<3>().norm() + std::min(change.head<3>().norm(), 2.0) * radius;
-}
 
 /// Bound on how far the arc of a vertex leaves its chord over this turn.
 double sagitta(const Vec6& change, double radius) {
@@ -41,13 +37,6 @@ struct SweptCloth {
         return {&cloth.surface, {}, reach, begin.data(), end.data(), tree.empty() ? nullptr : &tree};
     }
 };
-
-/// Mean motion of a cloth's nodes.
-Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end) {
-    Vec3 sum = Vec3::Zero();
-    for (int i = cloth.first_node; i < cloth.first_node + count; ++i) sum += end.nodes[i] - begin.nodes[i];
-    return sum / count;
-}
 
 /// Largest motion of a cloth's node relative to their mean.
 double uneven_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end) {
@@ -332,55 +321,6 @@ bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordin
 
 namespace {
 
-/// Bounds on how far vertices of objects move, common motion of a cloth with itself left out.
-class MotionBounds {
-public:
-    MotionBounds(const Zone& zone, const ZonePoint& point, const Coordinates& y_end)
-        : m_zone(zone), m_begin(point.y), m_end(y_end) {
-        for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
-            const int first = zone.cloths[c].first_node, count = zone.cloth(c).node_count();
-            const Vec3 mean = mean_motion(zone.cloths[c], count, point.y, y_end);
-            for (int i = first; i < first + count; ++i) {
-                const Vec3 change = y_end.nodes[i] - point.y.nodes[i];
-                m_nodes.push_back(change.norm());
-                m_uneven.push_back((change - mean).norm());
-            }
-        }
-    }
-
-    /// Contacts of the same two objects stand one after the other: of bodies the bound is found once for all of them.
-    double approach(const ZoneContact& contact) {
-        if (contact.cloth_a < 0 && contact.cloth_b < 0) {
-            if (contact.a != m_last_a || contact.b != m_last_b) {
-                m_last_a = contact.a;
-                m_last_b = contact.b;
-                m_last = body(contact.a) + (contact.contact.with_ground() ? 0.0 : body(contact.b));
-            }
-            return m_last;
-        }
-        const bool self = contact.contact.object_a == contact.contact.object_b;
-        return of(contact, true, self) + (contact.contact.with_ground() ? 0.0 : of(contact, false, self));
-    }
-
-private:
-    double body(int index) const {
-        return motion_bound(m_end.bodies[index] - m_begin.bodies[index], m_zone.mesh(index).radius);
-    }
-    double of(const ZoneContact& contact, bool of_a, bool self) const {
-        if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) return body(of_a ? contact.a : contact.b);
-        double bound = 0.0;
-        for (int node : feature_nodes(m_zone, contact, of_a))
-            if (node >= 0) bound = std::max(bound, (self ? m_uneven : m_nodes)[node]);
-        return bound;
-    }
-
-    const Zone& m_zone;
-    const Coordinates &m_begin, &m_end;
-    std::vector<double> m_nodes, m_uneven;
-    int m_last_a = kNobody, m_last_b = kNobody;
-    double m_last = 0.0;
-};
-
 /// Where everything is at the end of a motion; found when first asked for, since most motions bring no pair near.
 class MotionEnd {
 public:
@@ -405,7 +345,7 @@ double allowed_step(
     Clearance clearance) {
     if (impacts != nullptr) impacts->clear();
     if (zone.contacts.empty()) return 1.0;
-    MotionBounds motion(zone, point, y_end);
+    MotionBounds motion(zone, point.y, y_end);
     MotionEnd end(zone, y_end);
     double step = 1.0;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
@@ -417,7 +357,8 @@ double allowed_step(
         const double keep = std::min(wanted - contact.range.pole, (clearance == Clearance::floor ? 0.1 : 0.8) * room);
         ccd.min_distance = contact.range.pole + keep;
         ccd.tolerance = 0.2 * keep;
-        if (motion.approach(contact) < room - 1.2 * keep) continue;
+        if (impacts == nullptr) ccd.until = step;
+        if (ccd.until * motion.approach(contact) < room - 1.2 * keep) continue;
         const double toi = contact_toi(
             contact.contact, {surface_a(zone, contact, point.poses, point.nodes), end.surface(contact, true)},
             {surface_b(zone, contact, point.poses, point.nodes), end.surface(contact, false)}, zone.ground_height, ccd);

@@ -18,19 +18,20 @@ constexpr int kMaxStalls = 3;            // steps in a row that get a driven bod
 constexpr double kStall = 1e-3;          // of the way that is left
 constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
 constexpr int kMaxHardRounds = 50;
-constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
-constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
-constexpr double kFarFromBalance = 0.1;    // residual above which it matters most which contacts push,
-constexpr double kNearBalance = 0.03;      // and below which it no longer does
-constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
-constexpr int kFutileSteps = 50;           // without a lower energy: there is none to be found
-constexpr int kMaxQpSteps = 6000;          // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
-constexpr int kStepsWithoutQp = 1000;      // so many steps
-constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
-constexpr double kHeld = 0.1;              // of the way to its target: a body that moved less is held by something
-constexpr double kShortWay = 0.1;          // of a body's radius
-constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
+constexpr int kRelaxations = 8;          // Newton steps after driven bodies were stopped, before they go on
+constexpr double kRelaxed = 1e-2;        // residual at which they may go on earlier
+constexpr double kFarFromBalance = 0.1;  // residual above which it matters most which contacts push,
+constexpr double kNearBalance = 0.03;    // and below which it no longer does
+constexpr double kGoodEnough = 1e3;      // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;        // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;         // without a lower energy: there is none to be found
+constexpr int kMaxQpSteps = 6000;        // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
+constexpr int kStepsWithoutQp = 1000;    // so many steps
+constexpr double kContraction = 0.1;     // of the residual: steps with an old factor that do less are not worth it
+constexpr double kHeld = 0.1;            // of the way to its target: a body that moved less is held by something
+constexpr double kShortWay = 0.1;        // of a body's radius
+constexpr double kBeforeImpact = 1.0 - 1e-6;  // of the way to an impact: there rounding finds it once more
+constexpr double kClampedStep = 0.999999;     // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
 class ZoneSolver {
@@ -154,7 +155,7 @@ private:
         if (touching) return false;
         if (!m_zone.cloths.empty() && m_zone.elastic) return false;
         m_w.trial.y = m_w.y_end;
-        evaluate(m_zone, m_w.trial);
+        evaluate(m_zone, m_w.trial, &m_w.point);
         if (!m_w.trial.active.empty()) return false;
         accept_trial();
         return true;
@@ -189,10 +190,10 @@ private:
         for (int k = 0; k < kMaxHalvings; ++k) {
             const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr, clearance);
             if (allowed == 1.0 && gates_hold(m_gates, m_zone, m_w.trial.y)) {
-                evaluate(m_zone, m_w.trial);
+                evaluate(m_zone, m_w.trial, &m_w.point);
                 if (m_w.trial.energy < kInfinity) return step;
             }
-            step *= allowed < 1.0 ? allowed : 0.5;
+            step *= allowed < 1.0 ? kBeforeImpact * allowed : 0.5;
             set_trial(y_end, step);
         }
         return 0.0;
@@ -252,7 +253,7 @@ private:
             else
                 set_trial(m_w.y_end, step);
             if (step < 1.0 && k > 0 && allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr) < 1.0) continue;
-            evaluate(m_zone, m_w.trial);
+            evaluate(m_zone, m_w.trial, &m_w.point);
             const double change = m_w.trial.energy - m_w.point.energy;
             if (change <= kArmijo * step * slope0) return true;
             if (change <= noise) {
@@ -378,7 +379,7 @@ private:
                 return fail(ZoneStatus::no_descent);
             m_w.trial.y = y();
             for (int i = 0; i < m_zone.node_count(); ++i) m_w.trial.y.nodes[i] += m_w.step.nodes[i];
-            evaluate(m_zone, m_w.trial);
+            evaluate(m_zone, m_w.trial, &m_w.point);
             if (!std::isfinite(m_w.trial.energy)) return fail(ZoneStatus::no_descent);
             std::swap(m_w.point, m_w.trial);
         }
@@ -410,7 +411,7 @@ private:
         const Coordinates newton_end = m_w.y_end;
         const ImpactDirection direction = follow_impacts();
         const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
-        if (good) return covered_step();
+        if (good) return covered_step(direction.step);
         m_w.y_end = newton_end;
         m_w.y_end.bodies.resize(m_zone.bodies.size());
         for (std::size_t i = newton_end.bodies.size(); i < m_w.y_end.bodies.size(); ++i)
@@ -428,16 +429,17 @@ private:
         differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
         const double now = m_result.residual = current_accuracy().residual;
         if (!(now > kFarFromBalance || (go_on && now > kNearBalance && now < 0.5 * before))) return false;
-        follow_impacts();
-        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(covered_step())) return false;
+        const ImpactDirection direction = follow_impacts();
+        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(covered_step(direction.step))) return false;
         if (!(m_w.trial.energy < m_w.point.energy - current_noise())) return false;  // forces are rounding
         accept_trial();
         return m_last_was_qp = true;
     }
 
-    /// The allowed step to m_w.y_end, with the list of contacts complete for it.
-    double covered_step() {
-        ensure_covered(m_w.y_end);
+    /// The allowed step to m_w.y_end, with the list of contacts complete for it. `known`: what the list there is says of it.
+    double covered_step(double known = 0.0) {
+        const bool listed_anew = ensure_covered(m_w.y_end);
+        if (!listed_anew && known == 1.0 && gates_hold(m_gates, m_zone, m_w.y_end)) return 1.0;
         return arc_step(1.0);
     }
 
@@ -469,7 +471,7 @@ private:
         if (!is_covered(m_zone, m_coverage, m_w.y_end)) return false;
         if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
         m_w.trial.y = m_w.y_end;
-        evaluate(m_zone, m_w.trial);
+        evaluate(m_zone, m_w.trial, &m_w.point);
         if (!(m_w.trial.energy <= m_w.point.energy + current_noise())) return false;
         accept_trial();
         return true;

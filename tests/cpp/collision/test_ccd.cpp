@@ -192,6 +192,11 @@ TEST(planes_are_met_in_time) {
         CHECK(toi >= exact - kTolerance);
         CHECK(plane_toi(1.0, 0.2, keeping(keep)) == kNoImpact);
         CHECK(plane_toi(1.0, 3.0, keeping(keep)) == kNoImpact);
+        CcdOptions part = keeping(keep);
+        part.until = 0.6;
+        CHECK(plane_toi(1.0, -1.0, part) == toi);
+        part.until = 0.4;
+        CHECK(plane_toi(1.0, -1.0, part) == kNoImpact);
     }
 }
 
@@ -220,6 +225,13 @@ TEST(random_motions_are_safe_up_to_the_impact_and_close_at_it) {
 
         const double toi = motion.toi(keeping(keep)), until = std::min(toi, 1.0);
         for (int s = 0; s <= kSamples; ++s) CHECK(motion.distance(until * s / kSamples) >= keep - kRounding);
+        // Looked for up to some time only, the same impact is found if it is before that.
+        CcdOptions part = keeping(keep);
+        part.until = random.uniform(0.0, 1.0);
+        const double early = motion.toi(part);
+        CHECK((early == toi || early == kNoImpact));
+        if (toi < part.until) CHECK(early == toi);
+        if (toi > part.until + kTolerance) CHECK(early == kNoImpact);
         if (toi == kNoImpact) {
             ++misses;
             continue;

@@ -269,6 +269,41 @@ TEST(features_that_are_near_at_rest_keep_half_their_distance) {
     CHECK(contact_margins(model, near) == 0.02);
 }
 
+TEST(pairs_left_out_have_not_come_near) {
+    const Room room;
+    check::Random random(6);
+    int left_out = 0, looked_at = 0, active = 0;
+    for (int k = 0; k < 60; ++k) {
+        NOTE(k);
+        const Case c = random_case(room, random, k % 3 == 0 ? 0.003 : 0.03);
+        ZonePoint before;
+        before.y = random_coordinates(c, random);
+        evaluate(c.zone, before);
+        // On from there, twice: bounds may follow from bounds.
+        for (int hop = 0; hop < 2; ++hop) {
+            ZonePoint all, some;
+            all.y = some.y = random_coordinates(c, random);
+            evaluate(c.zone, all);
+            evaluate(c.zone, some, &before);
+            CHECK(some.energy == all.energy);
+            CHECK(some.contact_energy == all.contact_energy);
+            CHECK(some.active.size() == all.active.size());
+            for (std::size_t i = 0; i < all.active.size(); ++i) CHECK(some.active[i].index == all.active[i].index);
+            for (std::size_t i = 0; i < all.distances.size(); ++i) {
+                const bool known = some.distances[i] == all.distances[i];
+                CHECK((known || some.distances[i] > c.zone.contacts[i].range.rest));
+                CHECK(some.distances[i] <= all.distances[i] + 1e-15);
+                (known ? looked_at : left_out) += 1;
+            }
+            active += static_cast<int>(all.active.size());
+            before = some;
+        }
+    }
+    CHECK(left_out > 1000);
+    CHECK(looked_at > 1000);
+    CHECK(active > 100);
+}
+
 TEST(an_allowed_step_keeps_cloth_above_its_floor) {
     const Room room;
     check::Random random(4);
@@ -295,6 +330,7 @@ TEST(an_allowed_step_keeps_cloth_above_its_floor) {
         const double step = allowed_step(c.zone, point, c.end, &impacts);
         CHECK(step > 0.0);
         CHECK((step < 1.0 || impacts.empty()));
+        CHECK(allowed_step(c.zone, point, c.end, nullptr) == step);
         double nearest = kInfinity;
         for (const double part : {0.25, 0.5, 0.75, 0.9, 1.0}) {
             Coordinates y = c.begin;
