@@ -10,7 +10,6 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxRounds = 40;
-constexpr double kMaxTurn = 0.5;  // [rad] in one direction: rows hold their meaning over that
 constexpr int kMaxTurnLimits = 5;
 constexpr std::size_t kRowsPerCoordinate = 4;  // more do not lead further: the sheet would have to go another way
 constexpr double kNearby = 2.0;                // pairs this many contact ranges away are rows from the start
@@ -48,15 +47,16 @@ double wanted_distance(const ZoneContact& contact, bool pushes) {
 
 /// Solve the QP, and again with more mass for bodies that would turn too far.
 template <class Solve>
-int solve_with_limited_turns(const Zone& zone, std::vector<double>& mass_factor, const Coordinates& p, Solve&& solve) {
+int solve_with_limited_turns(
+    const Zone& zone, double max_turn, std::vector<double>& mass_factor, const Coordinates& p, Solve&& solve) {
     int newton_steps = 0;
     for (int k = 0; k < kMaxTurnLimits; ++k) {
         newton_steps += solve();
         bool limited = false;
         for (int i = 0; i < zone.dynamic_count; ++i) {
             const double turn = p.bodies[i].head<3>().norm();
-            if (turn <= 1.1 * kMaxTurn) continue;
-            mass_factor[i] *= turn / kMaxTurn;
+            if (turn <= 1.1 * max_turn) continue;
+            mass_factor[i] *= turn / max_turn;
             limited = true;
         }
         if (!limited) break;
@@ -110,7 +110,7 @@ Coordinates difference(const Coordinates& a, const Coordinates& b) {
 }  // namespace
 
 ImpactDirection impact_direction(
-    const Zone& zone, const ZonePoint& point, BlockSystem& system, const ImpactDirection* before) {
+    const Zone& zone, const ZonePoint& point, double max_turn, BlockSystem& system, const ImpactDirection* before) {
     const int count = zone.dynamic_count;
     const std::size_t coordinate_count = 6 * static_cast<std::size_t>(count) + 3 * zone.nodes.size();
     Coordinates gradient;
@@ -173,7 +173,7 @@ ImpactDirection impact_direction(
         ensure_pattern(zone, row_contacts, system);
         return solve_impact_qp(zone, gradient, mass_factor, cloth, rows, system, p);
     };
-    const auto solve = [&] { return solve_with_limited_turns(zone, mass_factor, p, solve_once); };
+    const auto solve = [&] { return solve_with_limited_turns(zone, max_turn, mass_factor, p, solve_once); };
     int newton_steps = solve();
     for (int round = 0; round < kMaxRounds; ++round) {
         for (int i = 0; i < zone.body_count(); ++i)

@@ -12,10 +12,11 @@ struct ImpactDirection {
 
 /// A direction past the impacts that stop a plain Newton step: pairs hit on the way to the target are linearised at
 /// their time of impact, the QP with these rows gives a new end point, and pairs hit on the way to that one are added
-/// until none is. Rows are straight and bodies turn: where a body would turn far, its mass is scaled up, which shortens
-/// its part of the direction until the rows mean something. `before`: what was found from here with fewer contacts listed,
+/// until none is. Rows are straight and bodies turn: where a body would turn further than `max_turn` [rad], its mass is
+/// scaled up, which shortens its part of the direction until the rows mean something. `before`: what was found from here with fewer contacts listed,
 /// or null.
 ImpactDirection impact_direction(
-    const Zone& zone, const ZonePoint& point, BlockSystem& system, const ImpactDirection* before = nullptr);
+    const Zone& zone, const ZonePoint& point, double max_turn, BlockSystem& system,
+    const ImpactDirection* before = nullptr);
 
 }  // namespace diffsim

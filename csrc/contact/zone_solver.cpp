@@ -31,7 +31,12 @@ constexpr double kContraction = 0.1;     // of the residual: steps with an old f
 constexpr double kHeld = 0.1;            // of the way to its target: a body that moved less is held by something
 constexpr double kShortWay = 0.1;        // of a body's radius
 constexpr double kBeforeImpact = 1.0 - 1e-6;  // of the way to an impact: there rounding finds it once more
-constexpr double kClampedStep = 0.999999;     // a step this long was not stopped by CCD in any way that matters
+constexpr double kMaxTurn = 0.5;              // [rad] of a body in an impact direction, to begin with
+constexpr double kLeastTurn = 1e-3;
+constexpr double kTurnFactor = 0.25;       // to less turn where less
+constexpr double kMostlyBlocked = 0.5;     // than this part of a direction is free, and back where more
+constexpr double kMostlyFree = 0.7;        // than this is
+constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
 class ZoneSolver {
@@ -393,12 +398,12 @@ private:
         Coordinates target = y();
         set_to_targets(target);
         ensure_covered(target);
-        ImpactDirection direction = impact_direction(m_zone, m_w.point, m_w.system);
+        ImpactDirection direction = impact_direction(m_zone, m_w.point, m_max_turn, m_w.system);
         m_qp_steps += direction.newton_steps;
         for (int k = 0; k < 8 && !is_covered(m_zone, m_coverage, direction.y_end); ++k) {
             list_contacts(direction.y_end);
             evaluate(m_zone, m_w.point);
-            direction = impact_direction(m_zone, m_w.point, m_w.system, &direction);
+            direction = impact_direction(m_zone, m_w.point, m_max_turn, m_w.system, &direction);
             m_qp_steps += direction.newton_steps;
         }
         m_w.y_end = direction.y_end;
@@ -411,7 +416,7 @@ private:
         const Coordinates newton_end = m_w.y_end;
         const ImpactDirection direction = follow_impacts();
         const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
-        if (good) return covered_step(direction.step);
+        if (good) return adapt_turns(covered_step(direction.step));
         m_w.y_end = newton_end;
         m_w.y_end.bodies.resize(m_zone.bodies.size());
         for (std::size_t i = newton_end.bodies.size(); i < m_w.y_end.bodies.size(); ++i)
@@ -430,10 +435,21 @@ private:
         const double now = m_result.residual = current_accuracy().residual;
         if (!(now > kFarFromBalance || (go_on && now > kNearBalance && now < 0.5 * before))) return false;
         const ImpactDirection direction = follow_impacts();
-        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(covered_step(direction.step))) return false;
+        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(adapt_turns(covered_step(direction.step))))
+            return false;
         if (!(m_w.trial.energy < m_w.point.energy - current_noise())) return false;  // forces are rounding
         accept_trial();
         return m_last_was_qp = true;
+    }
+
+    /// Rows are straight and bodies turn: where they leave their rows so early that little of a direction is free, they
+    /// should turn less in the next one, so that the others get on. Returns its argument, what is free.
+    double adapt_turns(double step) {
+        if (step < kMostlyBlocked)
+            m_max_turn = std::max(kTurnFactor * m_max_turn, kLeastTurn);
+        else if (step > kMostlyFree)
+            m_max_turn = std::min(m_max_turn / kTurnFactor, kMaxTurn);
+        return step;
     }
 
     /// The allowed step to m_w.y_end, with the list of contacts complete for it. `known`: what the list there is says of it.
@@ -499,8 +515,9 @@ private:
     ContactCoverage& m_coverage;
     std::vector<ImpactGate> m_gates;
     HardContacts m_hard;
-    double m_position = 0.0;  // size of the numbers that distances are differences of [m]
-    int m_qp_steps = 0;       // Newton steps of impact QPs so far
+    double m_max_turn = kMaxTurn;  // [rad] of the next impact direction
+    double m_position = 0.0;       // size of the numbers that distances are differences of [m]
+    int m_qp_steps = 0;            // Newton steps of impact QPs so far
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
     bool m_last_was_qp = false;              // of the steps so far

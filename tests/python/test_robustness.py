@@ -10,6 +10,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from penetration import PenetrationCheck
@@ -38,6 +39,29 @@ def test_heaps_whose_hessian_is_indefinite_converge(scene: int, steps: int) -> N
     options = ["--scenes", "1", "--first", str(scene), "--steps", str(steps)]
     found = subprocess.run([sys.executable, str(FUZZ), *options], capture_output=True, text=True, check=False)
     assert f"0 of {steps} steps in 0 scenes did not converge" in found.stdout, found.stdout + found.stderr
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_light_bodies_among_heavy_ones_converge(seed: int) -> None:
+    """Boxes and balls of 1 to 1000 kg fall on each other in four columns: light ones are squeezed and spun."""
+    random = np.random.default_rng(seed)
+    scene = ds.Scene()
+    scene.add_ground()
+    for i in range(32):
+        orientation = random.normal(size=4)
+        corner = 0.28 * np.array([i % 2, i // 2 % 2]) - 0.14 + random.uniform(-0.01, 0.01, 2)
+        scene.add_body(
+            ds.shapes.box((0.2, 0.16, 0.12)) if i % 2 else ds.shapes.icosphere(0.09, subdivisions=1),
+            position=(*corner, 0.2 + 0.3 * (i // 4)),
+            orientation=tuple(orientation / np.linalg.norm(orientation)),
+            mass=10.0 ** random.uniform(0.0, 3.0),
+        )
+    sim = ds.Simulator(scene, dt=0.01, num_threads=1, on_failure="raise")
+    with torch.no_grad():
+        trajectory = sim.rollout(sim.initial_state(), ds.Control(), steps=80)
+    assert sim.info is not None
+    assert sim.info.contacts > 20
+    assert_no_penetration(scene, sim, trajectory)
 
 
 def test_derivatives_in_random_scenes_with_cloth() -> None:

@@ -58,7 +58,7 @@ TEST(directions_past_impacts_lead_further_and_are_found_soon) {
         const double plain = allowed_step(pair.zone, pair.point, pair.targets, nullptr);
         if (plain == 1.0) continue;
         ++stopped;
-        const ImpactDirection direction = impact_direction(pair.zone, pair.point, pair.system);
+        const ImpactDirection direction = impact_direction(pair.zone, pair.point, 0.5, pair.system);
         CHECK(allowed_step(pair.zone, pair.point, direction.y_end, nullptr) == direction.step);
         further += direction.step > plain ? 1 : 0;
         most_steps = std::max(most_steps, direction.newton_steps);
