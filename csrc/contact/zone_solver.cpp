@@ -5,9 +5,9 @@
 #include <utility>
 
 #include "contact/hard_contacts.hpp"
-#include "contact/impact_gate.hpp"
 #include "contact/newton_direction.hpp"
 #include "contact/zone_accuracy.hpp"
+#include "contact/zone_path.hpp"
 
 namespace diffsim {
 namespace {
@@ -18,24 +18,18 @@ constexpr int kMaxStalls = 3;            // steps in a row that get a driven bod
 constexpr double kStall = 1e-3;          // of the way that is left
 constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
 constexpr int kMaxHardRounds = 50;
-constexpr int kRelaxations = 8;          // Newton steps after driven bodies were stopped, before they go on
-constexpr double kRelaxed = 1e-2;        // residual at which they may go on earlier
-constexpr double kFarFromBalance = 0.1;  // residual above which it matters most which contacts push,
-constexpr double kNearBalance = 0.03;    // and below which it no longer does
-constexpr double kGoodEnough = 1e3;      // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;        // without halving the residual: rounding's sign
-constexpr int kFutileSteps = 50;         // without a lower energy: there is none to be found
-constexpr int kMaxQpSteps = 6000;        // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
-constexpr int kStepsWithoutQp = 1000;    // so many steps
-constexpr double kContraction = 0.1;     // of the residual: steps with an old factor that do less are not worth it
-constexpr double kHeld = 0.1;            // of the way to its target: a body that moved less is held by something
-constexpr double kShortWay = 0.1;        // of a body's radius
-constexpr double kBeforeImpact = 1.0 - 1e-6;  // of the way to an impact: there rounding finds it once more
-constexpr double kMaxTurn = 0.5;              // [rad] of a body in an impact direction, to begin with
-constexpr double kLeastTurn = 1e-3;
-constexpr double kTurnFactor = 0.25;       // to less turn where less
-constexpr double kMostlyBlocked = 0.5;     // than this part of a direction is free, and back where more
-constexpr double kMostlyFree = 0.7;        // than this is
+constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
+constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
+constexpr double kFarFromBalance = 0.1;    // residual above which it matters most which contacts push,
+constexpr double kNearBalance = 0.03;      // and below which it no longer does
+constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;           // without a lower energy: there is none to be found
+constexpr int kMaxQpSteps = 6000;          // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
+constexpr int kStepsWithoutQp = 1000;      // so many steps
+constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
+constexpr double kHeld = 0.1;              // of the way to its target: a body that moved less is held by something
+constexpr double kShortWay = 0.1;          // of a body's radius
 constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
 
 /// State of one solve; the steps of solve_zone as members.
@@ -45,11 +39,10 @@ public:
         Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
         std::vector<Box>& visited)
         : m_zone(zone),
-          m_passive(passive),
           m_options(options),
           m_w(workspace),
           m_visited(visited),
-          m_coverage(workspace.coverage) {}
+          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
 
     ZoneResult solve() {
         start();
@@ -75,33 +68,26 @@ private:
         m_w.point.y.assign_zero(count, m_zone.nodes.size());
         m_w.y_end.resize(count, m_zone.nodes.size());
         set_to_expected_ends(m_w.y_end);
-        list_contacts(m_w.y_end);
+        m_path.list_contacts(m_w.y_end);
         evaluate(m_zone, m_w.point);
+        bool rescue = false;  // some objects start the step below their floor
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
             const ContactRange& range = m_zone.contacts[k].range;
-            m_rescue = m_rescue || m_w.point.distances[k] < range.floor;
+            rescue = rescue || m_w.point.distances[k] < range.floor;
             if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
             m_result.status = ZoneStatus::bad_start;
             m_result.worst_contact = static_cast<int>(k);
             return;
         }
-        if (m_rescue) {
-            rescue_contacts(m_zone);
-            evaluate(m_zone, m_w.point);
-        }
+        if (rescue) m_path.rescue();
         m_visited.assign(count + m_zone.cloths.size(), Box());
         mark_visited();
-    }
-
-    void set_to_targets(Coordinates& y_end) const {
-        for (std::size_t i = 0; i < y_end.bodies.size(); ++i) y_end.bodies[i] = m_zone.bodies[i].target;
-        for (std::size_t i = 0; i < y_end.nodes.size(); ++i) y_end.nodes[i] = m_zone.nodes[i].target;
     }
 
     /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that reach
     /// to their targets would be full of neighbours that they never meet.
     void set_to_expected_ends(Coordinates& y_end) const {
-        set_to_targets(y_end);
+        m_path.set_to_targets(y_end);
         for (std::size_t i = 0; i < y_end.bodies.size(); ++i) {
             const ZoneBody& body = m_zone.bodies[i];
             const double radius = m_zone.mesh(static_cast<int>(i)).radius;
@@ -109,29 +95,6 @@ private:
             const double falling = extent(body.target);
             if (falling < kShortWay * radius && extent(body.warm) < kHeld * falling) y_end.bodies[i] = body.warm;
         }
-    }
-
-    /// List contacts for the way from the current point to y_end.
-    void list_contacts(Coordinates& y_end) {
-        collect_contacts(m_zone, m_passive, y(), y_end, m_coverage);
-        if (m_rescue) rescue_contacts(m_zone);
-        m_hard.restore(m_zone);
-        m_position = m_zone.model->thickness;
-        if (m_zone.model->ground.present) m_position = std::max(m_position, std::abs(m_zone.ground_height));
-        for (int i = 0; i < m_zone.body_count(); ++i) {
-            const ZoneBody& body = m_zone.bodies[i];
-            m_position = std::max(m_position, body.start.t.cwiseAbs().maxCoeff() + m_zone.mesh(i).radius);
-        }
-        for (const ZoneNode& node : m_zone.nodes) m_position = std::max(m_position, node.start.cwiseAbs().maxCoeff());
-        m_w.system.set_pattern(base_pattern(m_zone));
-    }
-
-    /// Make the list complete for a step to y_end; true if it had to be made anew.
-    bool ensure_covered(Coordinates& y_end) {
-        if (is_covered(m_zone, m_coverage, y()) && is_covered(m_zone, m_coverage, y_end)) return false;
-        list_contacts(y_end);
-        evaluate(m_zone, m_w.point);
-        return true;
     }
 
     void mark_visited() {
@@ -147,14 +110,13 @@ private:
     /// Nothing touches on the way to the target and there: done without an iteration.
     bool try_free_motion() {
         m_w.y_end.bodies.resize(m_zone.bodies.size());
-        set_to_targets(m_w.y_end);
+        m_path.set_to_targets(m_w.y_end);
         const bool touching = !m_w.point.active.empty();
         if (touching && !may_pass(m_zone, m_w.y_end)) return false;
-        ensure_covered(m_w.y_end);
+        m_path.ensure_covered(m_w.y_end);
         if ((m_zone.dynamic_count > 0 || !m_zone.elastic) &&
             allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
-            m_gates = find_impact_gates(m_zone, m_w.point, m_w.y_end);
-            for (const ImpactGate& gate : m_gates) m_result.fast_impacts += gate.fast ? 1 : 0;
+            m_result.fast_impacts = m_path.set_gates(m_w.y_end);
             return false;
         }
         if (touching) return false;
@@ -172,11 +134,11 @@ private:
         for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].warm;
         for (int i = 0; i < m_zone.node_count(); ++i)
             if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
-        if (largest_move() < kEpsilon * m_position) return;
-        ensure_covered(m_w.y_end);
+        if (largest_move() < kEpsilon * m_path.position()) return;
+        m_path.ensure_covered(m_w.y_end);
         // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and
         // descend from there to minimisers that no motion of that energy can reach.
-        const double step = clear_step(m_w.y_end, Clearance::landing);
+        const double step = m_path.clear_step(m_w.y_end, Clearance::landing);
         if (step > 0.0 && m_w.trial.energy <= m_w.point.energy) accept_trial();
     }
 
@@ -185,31 +147,6 @@ private:
     void accept_trial() {
         std::swap(m_w.point, m_w.trial);
         mark_visited();
-    }
-
-    /// Evaluate the trial at the longest allowed part of the way to y_end. A shortened arc is not on the chord that was
-    /// checked, so it is checked again. 0 if no part is allowed.
-    double clear_step(const Coordinates& y_end, Clearance clearance = Clearance::floor) {
-        double step = 1.0;
-        m_w.trial.y = y_end;
-        for (int k = 0; k < kMaxHalvings; ++k) {
-            const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr, clearance);
-            if (allowed == 1.0 && gates_hold(m_gates, m_zone, m_w.trial.y)) {
-                evaluate(m_zone, m_w.trial, &m_w.point);
-                if (m_w.trial.energy < kInfinity) return step;
-            }
-            step *= allowed < 1.0 ? kBeforeImpact * allowed : 0.5;
-            set_trial(y_end, step);
-        }
-        return 0.0;
-    }
-
-    void set_trial(const Coordinates& y_end, double step) {
-        m_w.trial.y.resize(y_end.bodies.size(), y_end.nodes.size());
-        for (std::size_t i = 0; i < y_end.bodies.size(); ++i)
-            m_w.trial.y.bodies[i] = y().bodies[i] + step * (y_end.bodies[i] - y().bodies[i]);
-        for (std::size_t i = 0; i < y_end.nodes.size(); ++i)
-            m_w.trial.y.nodes[i] = y().nodes[i] + step * (y_end.nodes[i] - y().nodes[i]);
     }
 
     bool drives_done() const {
@@ -222,8 +159,8 @@ private:
 
     // --- Newton ------------------------------------------------------------------------------------------------
 
-    Accuracy current_accuracy() const { return accuracy(m_zone, m_w.derivatives, m_position); }
-    double current_noise() { return energy_noise(m_zone, m_w.point, m_w.system, m_position, m_w.pushed); }
+    Accuracy current_accuracy() const { return accuracy(m_zone, m_w.derivatives, m_path.position()); }
+    double current_noise() { return energy_noise(m_zone, m_w.point, m_w.system, m_path.position(), m_w.pushed); }
 
     double slope(const Coordinates& gradient) const {
         double sum = 0.0;
@@ -256,7 +193,7 @@ private:
             if (step == 1.0)
                 m_w.trial.y = m_w.y_end;
             else
-                set_trial(m_w.y_end, step);
+                m_path.set_trial(m_w.y_end, step);
             if (step < 1.0 && k > 0 && allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr) < 1.0) continue;
             evaluate(m_zone, m_w.trial, &m_w.point);
             const double change = m_w.trial.energy - m_w.point.energy;
@@ -323,7 +260,7 @@ private:
             const Accuracy now = current_accuracy();
             m_result.residual = now.residual;
             set_step_end();
-            const double rounding_step = 16.0 * kEpsilon * m_position;
+            const double rounding_step = 16.0 * kEpsilon * m_path.position();
             if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
                 polish();
                 return;
@@ -352,12 +289,12 @@ private:
             relaxations = now.residual < kRelaxed ? 0 : std::max(relaxations - 1, 0);
             // The step's end may lie where contacts have not been listed yet. New ones are beyond their rest distance
             // here, so energy and derivatives stand.
-            ensure_covered(m_w.y_end);
+            m_path.ensure_covered(m_w.y_end);
             double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
             if (driven && step < kClampedStep && !without_qp)
                 step = past_impacts(step, true);
-            else if (step < 1.0 || !gates_hold(m_gates, m_zone, m_w.y_end))
-                step = arc_step(step);
+            else if (step < 1.0 || !m_path.gates_hold(m_w.y_end))
+                step = m_path.arc_step(m_w.y_end, step);
             if (line_search(step)) {
                 accept_trial();
                 const bool is_last = m_result.iterations + 1 >= m_options.max_iterations;
@@ -392,36 +329,27 @@ private:
         m_result.residual = current_accuracy().residual;
     }
 
-    /// Let m_w.y_end be where the QP of all nearby contacts leads.
-    ImpactDirection follow_impacts() {
+    /// Let m_w.y_end be where the QP of all nearby contacts leads, and return how much of the way is free for all that is
+    /// listed there.
+    double follow_impacts() {
         m_newton.lose_factor();  // the QP factorizes its own matrix
-        Coordinates target = y();
-        set_to_targets(target);
-        ensure_covered(target);
-        ImpactDirection direction = impact_direction(m_zone, m_w.point, m_max_turn, m_w.system);
+        const ImpactDirection direction = m_path.past_impacts();
         m_qp_steps += direction.newton_steps;
-        for (int k = 0; k < 8 && !is_covered(m_zone, m_coverage, direction.y_end); ++k) {
-            list_contacts(direction.y_end);
-            evaluate(m_zone, m_w.point);
-            direction = impact_direction(m_zone, m_w.point, m_max_turn, m_w.system, &direction);
-            m_qp_steps += direction.newton_steps;
-        }
         m_w.y_end = direction.y_end;
-        m_w.y_end.bodies.resize(m_zone.bodies.size());
-        return direction;
+        return direction.step;
     }
 
     /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
     double past_impacts(double newton_limit, bool driven) {
         const Coordinates newton_end = m_w.y_end;
-        const ImpactDirection direction = follow_impacts();
-        const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && direction.step >= newton_limit);
-        if (good) return adapt_turns(covered_step(direction.step));
+        const double free = follow_impacts();
+        const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && free >= newton_limit);
+        if (good) return m_path.step_past_impacts(m_w.y_end, free);
         m_w.y_end = newton_end;
         m_w.y_end.bodies.resize(m_zone.bodies.size());
         for (std::size_t i = newton_end.bodies.size(); i < m_w.y_end.bodies.size(); ++i)
             m_w.y_end.bodies[i] = m_zone.bodies[i].target;
-        return covered_step();
+        return m_path.covered_step(m_w.y_end);
     }
 
     /// Where many contacts come and go, as when flat faces land on each other, a Newton step only tells which of them push
@@ -434,41 +362,12 @@ private:
         differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
         const double now = m_result.residual = current_accuracy().residual;
         if (!(now > kFarFromBalance || (go_on && now > kNearBalance && now < 0.5 * before))) return false;
-        const ImpactDirection direction = follow_impacts();
-        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(adapt_turns(covered_step(direction.step))))
+        const double free = follow_impacts();
+        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(m_path.step_past_impacts(m_w.y_end, free)))
             return false;
         if (!(m_w.trial.energy < m_w.point.energy - current_noise())) return false;  // forces are rounding
         accept_trial();
         return m_last_was_qp = true;
-    }
-
-    /// Rows are straight and bodies turn: where they leave their rows so early that little of a direction is free, they
-    /// should turn less in the next one, so that the others get on. Returns its argument, what is free.
-    double adapt_turns(double step) {
-        if (step < kMostlyBlocked)
-            m_max_turn = std::max(kTurnFactor * m_max_turn, kLeastTurn);
-        else if (step > kMostlyFree)
-            m_max_turn = std::min(m_max_turn / kTurnFactor, kMaxTurn);
-        return step;
-    }
-
-    /// The allowed step to m_w.y_end, with the list of contacts complete for it. `known`: what the list there is says of it.
-    double covered_step(double known = 0.0) {
-        const bool listed_anew = ensure_covered(m_w.y_end);
-        if (!listed_anew && known == 1.0 && gates_hold(m_gates, m_zone, m_w.y_end)) return 1.0;
-        return arc_step(1.0);
-    }
-
-    /// Shorten a step until the chords to its end are clear.
-    double arc_step(double step) {
-        for (int k = 0; k < kMaxHalvings && step > 0.0; ++k) {
-            m_w.trial.y = m_w.y_end;
-            if (step < 1.0) set_trial(m_w.y_end, step);
-            const double allowed = allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr);
-            if (allowed == 1.0 && gates_hold(m_gates, m_zone, m_w.trial.y)) return step;
-            step *= std::min(allowed, 0.9);
-        }
-        return 0.0;
     }
 
     /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
@@ -477,14 +376,14 @@ private:
     DriveProgress advance_drives(double step, int& stalls) {
         stalls = step < kStall ? stalls + 1 : 0;
         if (stalls > kMaxStalls) return DriveProgress::blocked;
-        return step > 0.0 && clear_step(m_w.y_end) > 0.0 ? DriveProgress::moved : DriveProgress::waits;
+        return step > 0.0 && m_path.clear_step(m_w.y_end) > 0.0 ? DriveProgress::moved : DriveProgress::waits;
     }
 
     /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel. False if there
     /// is nothing to gain.
     bool polish() {
         if (m_w.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return false;
-        if (!is_covered(m_zone, m_coverage, m_w.y_end)) return false;
+        if (!m_path.covers(m_w.y_end)) return false;
         if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
         m_w.trial.y = m_w.y_end;
         evaluate(m_zone, m_w.trial, &m_w.point);
@@ -496,7 +395,7 @@ private:
     /// Rounds of multipliers until hard contacts are at their rest distance.
     void harden() {
         for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
-            const double violation = HardContacts::violation(m_zone, m_w.point, m_position);
+            const double violation = HardContacts::violation(m_zone, m_w.point, m_path.position());
             if (violation <= kHardTolerance) return;
             if (round >= kMaxHardRounds) return fail(ZoneStatus::too_many_iterations);
             m_hard.shift(m_zone, m_w.point, violation);
@@ -508,20 +407,15 @@ private:
     void fail(ZoneStatus status) { m_result.status = status; }
 
     Zone& m_zone;
-    const PassiveBodies& m_passive;
     const ZoneOptions& m_options;
     ZoneWorkspace& m_w;
     std::vector<Box>& m_visited;
-    ContactCoverage& m_coverage;
-    std::vector<ImpactGate> m_gates;
     HardContacts m_hard;
-    double m_max_turn = kMaxTurn;  // [rad] of the next impact direction
-    double m_position = 0.0;       // size of the numbers that distances are differences of [m]
-    int m_qp_steps = 0;            // Newton steps of impact QPs so far
+    ZonePath m_path;
+    int m_qp_steps = 0;  // Newton steps of impact QPs so far
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
     bool m_last_was_qp = false;              // of the steps so far
-    bool m_rescue = false;                   // some objects start the step below their floor
     ZoneResult m_result;
 };
 
