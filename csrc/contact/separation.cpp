@@ -3,7 +3,6 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 
-#include "contact/impact_qp.hpp"
 #include "contact/zone_contacts.hpp"
 
 namespace diffsim {

@@ -152,7 +152,7 @@ struct ZonePoint {
     std::vector<Pose> poses;
     std::vector<Vec3> nodes;        ///< positions, zone frame
     std::vector<Vec3> vertices;     ///< of bodies, zone frame; those of Zone::feature_vertices
-    std::vector<double> distances;  ///< one per contact, of active ones; what the others at least have
+    std::vector<double> distances;  ///< one per contact; beyond its rest distance maybe a lower bound [m]
     std::vector<ActiveContact> active;
     double energy = 0.0;          ///< infinite at or below a pole
     double contact_energy = 0.0;  ///< the contacts' part
