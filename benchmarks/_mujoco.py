@@ -1,4 +1,4 @@
-"""MuJoCo's side of the benchmarks of boxes on a plane; its steps are looped over in C."""
+"""MuJoCo's side of the benchmarks of bodies on a plane; its steps are looped over in C."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from numpy.typing import ArrayLike
+
+import diffsim as ds
 
 CONES = ("pyramidal", "elliptic")
 _START = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -40,6 +42,50 @@ def boxes(
     data = mujoco.MjData(model)
     data.qvel.reshape(-1, 6)[:, :3] = velocity
     return model, data
+
+
+def frictionless(scene: ds.Scene, state: ds.State, *, dt: float) -> tuple[Any, Any]:
+    """Model and data of the bodies of a scene at a state, without friction, else with default options.
+
+    Meshes of 8 vertices are boxes, and must be upright in their body's frame; of others MuJoCo takes the convex hull.
+    """
+    p = scene.pack()
+    meshes, bodies = [], []
+    last = np.cumsum(p.vertex_count)
+    for body, (name, count) in enumerate(zip(p.names, p.vertex_count)):
+        points = p.vertices[last[body] - count : last[body]]
+        if count == 8:
+            shape = f'type="box" size="{_numbers(np.ptp(points, axis=0) / 2)}"'
+        else:
+            shape = f'type="mesh" mesh="{name}"'
+            meshes.append(f'<mesh name="{name}" vertex="{_numbers(points)}"/>')
+        place = f'pos="{_numbers(state.position[body])}" quat="{_numbers(state.orientation[body])}"'
+        if p.kind[body] == 0:
+            inertia = p.inertia[body][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+            mass = f'<inertial pos="0 0 0" mass="{p.mass[body]}" fullinertia="{_numbers(inertia)}"/>'
+            bodies.append(f"<body {place}><freejoint/>{mass}<geom {shape}/></body>")
+        else:
+            bodies.append(f"<geom {shape} {place}/>")
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="{dt}" gravity="{_numbers(p.gravity)}"/><default><geom condim="1"/></default>
+        <asset>{"".join(meshes)}</asset><worldbody><geom type="plane" size="0 0 1" pos="0 0 {p.ground_height}"/>
+        {"".join(bodies)}</worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    moving = p.kind == 0
+    velocity = data.qvel.reshape(-1, 6)
+    velocity[:, :3] = state.velocity[moving]
+    for k, body in enumerate(np.flatnonzero(moving)):  # MuJoCo's is in the body's frame
+        mujoco.mju_rotVecQuat(
+            velocity[k, 3:],
+            state.angular_velocity[body].numpy(),
+            state.orientation[body].numpy() * [1.0, -1.0, -1.0, -1.0],
+        )
+    return model, data
+
+
+def _numbers(values: ArrayLike) -> str:
+    return " ".join(f"{value:.17g}" for value in np.ravel(np.asarray(values)))
 
 
 def ways_to_step(model: Any, data: Any, steps: int) -> dict[str, Callable[[], object]]:

@@ -10,11 +10,15 @@ from .contact import (
     tilted_box,
     two_spheres,
 )
+from .heaps import boxes_in_bin, collapsing_stack, heap_of_boxes_and_balls, touching_boxes, tumbling_layers
 from .piles import falling_cubes, row_of_cubes, two_layer_stack
 
 __all__ = [
     "box_on_box",
+    "boxes_in_bin",
+    "collapsing_stack",
     "falling_cubes",
+    "heap_of_boxes_and_balls",
     "kinematic_pusher",
     "nonconvex_pair",
     "resting_box",
@@ -22,6 +26,8 @@ __all__ = [
     "tetrahedron_in_groove",
     "tetrahedron_on_box",
     "tilted_box",
+    "touching_boxes",
+    "tumbling_layers",
     "two_layer_stack",
     "two_spheres",
 ]

@@ -19,6 +19,7 @@ COLUMNS = {
     "batch": ("case", "scenes", "loop_forward_per_s", "gradient_ratio"),
     "cloth": ("side_nodes", "forward_contact_ms", "mujoco_step_ms", "backward_to_forward", "vbd_depth_m"),
     "cloth_accuracy": ("scene", "name", "time_ms_per_s", "step_error_mm", "error_mm", "depth_mm"),
+    "contact_rich": ("scene", "forward_ms", "longest_ms", "failed_steps", "forward_to_mujoco", "longest_to_resting"),
     "falling_cubes": ("cubes", "forward_s", "mujoco_elliptic_s", "memory_mb", "rest_gap_m"),
     "fast_differentiation": ("cubes", "mode", "backward_ms", "memory_mb", "error", "backward_to_mujoco"),
     "local_collisions": ("cubes", "step", "mode", "local_ms", "global_ms", "lcp_published_ms", "paper_code_ms"),

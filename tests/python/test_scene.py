@@ -465,6 +465,11 @@ def test_shared_scenes_take_their_size() -> None:
     assert len(scenes.falling_cubes(7).pack().names) == 7
     assert len(scenes.row_of_cubes(7).pack().names) == 7
     assert len(scenes.two_layer_stack(7).pack().names) == 13
+    assert len(scenes.collapsing_stack(7).pack().names) == 7
+    assert len(scenes.boxes_in_bin(7).pack().names) == 7 + 4
+    assert len(scenes.tumbling_layers(3, layers=2).pack().names) == 18
+    assert len(scenes.heap_of_boxes_and_balls(7).pack().names) == 7
+    assert len(scenes.touching_boxes(7).pack().names) == 7
     assert scenes.falling_cubes(1).pack().vertices.shape == (8, 3)
     free = scenes.box_on_box(fixed=False)
     free.validate(free.pack())
