@@ -98,13 +98,12 @@ def heap_of_boxes_and_balls(count: int = 32, *, heaviest: float = 1000.0, seed: 
 
 
 def touching_boxes(count: int = 10, *, edge: float = 0.2, gap: float = 1e-3) -> Scene:
-    """`count` cubes of `edge` [m] on the ground in two rows, each with its sides against its neighbours'."""
+    """`count` cubes of `edge` [m] on the ground two by two, side against side, `gap` [m] apart; pairs stand apart."""
     scene = Scene()
     scene.add_ground()
-    pitch = edge + gap
     for index in range(count):
         column, row = divmod(index, 2)
-        position = (pitch * column, pitch * row, 0.5 * edge + gap)
+        position = (2.0 * edge * column, (edge + gap) * row, 0.5 * edge + gap)
         scene.add_body(box(edge), density=1000.0, position=position, name=f"box_{index}")
     return scene
 
