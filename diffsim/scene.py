@@ -10,10 +10,11 @@ from ._arguments import KINDS, Kind, body_kind, finite_array, number, positive, 
 from ._body_shape import Shape, mesh_shape, round_shape
 from ._cloth_shape import cloth_shape
 from ._handles import BodyCount, BodyHandle, ClothHandle
-from ._interpenetration import GROUND, Solid, find_overlaps, find_self_crossing
+from ._interpenetration import GROUND, find_overlaps, find_self_crossing
 from ._mass_properties import capsule_mass_properties, sphere_mass_properties
 from ._mesh import read_mesh
 from ._packed import Body, Cloth, Ground, PackedScene, pack_scene, rotation_matrix
+from ._surfaces import Solid
 from .materials import ClothMaterial
 
 __all__ = ["BodyHandle", "ClothHandle", "PackedScene", "Scene"]

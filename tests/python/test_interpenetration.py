@@ -7,7 +7,7 @@ import ipctk
 import numpy as np
 import pytest
 
-from diffsim import _interpenetration, scenes, shapes
+from diffsim import _interpenetration, _surfaces, scenes, shapes
 from diffsim._mesh_queries import (
     distance_to_surface,
     point_triangle_distance,
@@ -84,7 +84,7 @@ def test_touching_meshes_pass_the_exact_test_of_triangles(refined: bool) -> None
             scene = pair(box, box, shift, world=world)
             packed = scene.pack()
             solids = scene._solids(packed)
-            assert len(_interpenetration._meeting_faces(*solids)) > 0 or world is not None
+            assert len(_surfaces.meeting_faces(*solids)) > 0 or world is not None
             assert _interpenetration._pair_depth(*solids) == 0.0
 
 
