@@ -9,7 +9,8 @@ import numpy as np
 
 from ._arguments import Kind, inertia_matrix, positive
 from ._mass_properties import FloatArray, IntArray, MassProperties, mesh_mass_properties
-from ._mesh import edge_defects, is_flat, require_solid
+from ._mesh import edge_defects, is_flat
+from ._volume import require_solid
 
 _NO_MASS = "{where}: a dynamic body needs density= [kg/m³] or mass= [kg]; or give kind='static'"
 
@@ -41,11 +42,13 @@ def mesh_shape(
         return Shape(vertices, faces, center, 0.0, np.zeros((3, 3)), closed, margin)
     if density is None and mass is None:
         raise ValueError(_NO_MASS.format(where=where))
-    if solid or mass is None or inertia is None:
+    try:
         faces = require_solid(vertices, faces, where)
         properties = mesh_mass_properties(vertices, faces)
-    else:
-        properties = MassProperties(1.0, np.zeros(3), inertia / mass)
+    except ValueError:
+        if mass is None or inertia is None:
+            raise
+        properties = MassProperties(1.0, np.zeros(3), inertia / mass)  # all of it is given, but for the centre
     mass, inertia = _scaled(properties, density, mass, inertia)
     return Shape(vertices, faces, properties.center, mass, inertia, closed, margin)
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ._mass_properties import FloatArray, IntArray, mesh_mass_properties
-from ._mesh_queries import winding_number
+from ._mass_properties import FloatArray, IntArray
 
 NDArrayInt = NDArray[np.int64]
 
@@ -192,18 +191,25 @@ def edge_defects(faces: IntArray) -> EdgeDefects:
     A mesh is closed when every edge is run through as often in one direction as in the other. Two closed parts that
     share an edge pass: what they enclose is well defined.
     """
-    vertex_count = int(faces.max()) + 1
-    start = faces.astype(np.int64).ravel()
-    end = np.roll(faces, -1, axis=1).astype(np.int64).ravel()
-    key = np.minimum(start, end) * vertex_count + np.maximum(start, end)
-    _, edge = np.unique(key, return_inverse=True)
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    edge = edge_numbers(faces).ravel()
     balance = np.bincount(edge, weights=np.where(start < end, 1.0, -1.0))
     odd = np.bincount(edge) % 2 == 1
     return EdgeDefects(int(np.count_nonzero(odd)), int(np.count_nonzero((balance != 0.0) & ~odd)))
 
 
+def edge_numbers(faces: IntArray) -> IntArray:
+    """For each face its three edges, numbered from 0, shape (m, 3)."""
+    ends = np.stack([faces, np.roll(faces, -1, axis=1)]).astype(np.int64)
+    key = ends.min(axis=0) * (int(faces.max()) + 1) + ends.max(axis=0)
+    return np.unique(key, return_inverse=True)[1].reshape(-1, 3).astype(np.int32)
+
+
 def face_components(faces: IntArray) -> IntArray:
-    """Number the connected parts of a mesh: for each face the part it belongs to, from 0, shape (m,)."""
+    """Number the connected parts of a mesh: for each face the part it belongs to, from 0, shape (m,).
+
+    Connected are faces with a vertex in common or, of the result of `edge_numbers`, with an edge.
+    """
     labels = np.arange(int(faces.max()) + 1)
     while True:
         lowest = labels[faces].min(axis=1)
@@ -222,44 +228,3 @@ def is_flat(volume: float, vertices: FloatArray) -> bool:
     """Whether the volume [m³] a closed mesh encloses, of either sign, is no more than rounding."""
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     return not abs(volume) > _FLAT_VOLUME * diagonal**3
-
-
-def require_solid(vertices: FloatArray, faces: IntArray, where: str) -> IntArray:
-    """Make sure that a mesh encloses a volume, and return its faces oriented outwards.
-
-    A closed mesh whose faces all point inwards is turned around: there is only one solid it can mean.
-
-    Raises: ValueError naming the defect: an open or inconsistently oriented mesh, a flat one, or separate parts of
-        which some point inwards without being a cavity of another.
-    """
-    defects = edge_defects(faces)
-    if defects.open_count:
-        raise ValueError(
-            f"{where}: the mesh is open ({defects.open_count} boundary edges), so it has no volume to take mass and "
-            "inertia from; close it (pymeshfix, trimesh: mesh.fill_holes()), merge vertices if they are merely "
-            "repeated (trimesh: mesh.merge_vertices()), give both mass= and inertia=, or make it static"
-        )
-    if defects.misoriented_count:
-        raise ValueError(
-            f"{where}: the mesh's faces are not consistently oriented ({defects.misoriented_count} edges with faces "
-            "that disagree), so its volume is not defined; orient them (trimesh: mesh.fix_normals())"
-        )
-    properties = mesh_mass_properties(vertices, faces)
-    if is_flat(properties.mass, vertices):
-        raise ValueError(
-            f"{where}: the mesh is closed but encloses no volume ({properties.mass:.3g} m³); give it some thickness, "
-            "or give both mass= and inertia="
-        )
-    if properties.mass < 0.0:
-        faces = np.ascontiguousarray(faces[:, ::-1])
-    component = face_components(faces)
-    for part in range(int(component.max()) + 1) if component.max() else ():
-        inside = component == part
-        if mesh_mass_properties(vertices, faces[inside]).mass < 0.0:
-            probe = vertices[faces[inside][0]].mean(axis=0, keepdims=True)
-            if winding_number(probe, vertices[faces[~inside]])[0] < 0.5:
-                raise ValueError(
-                    f"{where}: part {part} of the mesh points inwards but is no cavity of another part; orient all "
-                    "parts outwards (trimesh: mesh.fix_normals())"
-                )
-    return faces

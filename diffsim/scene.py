@@ -83,7 +83,9 @@ class Scene:
 
         A dynamic body needs either `density` or `mass`, and a closed mesh to distribute it over; with both `mass` and
         `inertia` the mesh may be open, and its frame's origin is taken for the centre of mass. If all faces of a closed
-        mesh point inwards they are turned around. Static and kinematic bodies need none of this: their mesh may be open
+        mesh point inwards they are turned around. A mesh of several parts must not count volume twice: its parts may
+        touch, and one whose faces point inwards is a cavity of the part around it, but they must not overlap, repeat
+        or contain one another; with both `mass` and `inertia` they may, as an open mesh. Static and kinematic bodies need none of this: their mesh may be open
         (a terrain, whose frame's origin then serves as centre of mass), or closed with its faces inwards (a room).
 
         Args:
