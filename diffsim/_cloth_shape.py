@@ -11,11 +11,18 @@ from numpy.typing import NDArray
 from ._arguments import finite_array
 from ._mass_properties import FloatArray, IntArray
 from ._mesh import check_triangles, read_mesh_in_order, to_numpy
+from ._mesh_queries import point_triangle_distance, segment_segment_distance
 
 # A triangle lower than this fraction of its longest edge, at rest, has no strain worth the name (csrc/model/cloth.cpp).
 _LEAST_HEIGHT = 1e-6
 # The warp's direction must not be shorter than this, or it is a mistake rather than a direction.
 _SHORTEST_DIRECTION = 1e-12
+# A vertex nearer to a triangle than this fraction of its longest edge lies on it, up to the rounding of files that keep
+# single precision.
+_TOUCHING = 1e-6
+_CELLS_A_BOX = 16  # that a triangle covers on average at most, while looking for vertices near it
+
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,7 @@ def cloth_shape(mesh: Any, rest: Any, warp: Any, pinned: Any, where: str) -> Clo
         at_rest = finite_array(rest, f"{where}: rest", vertices.shape)
     what = f"{where}: {'mesh' if rest is None else 'rest shape'}"
     check_triangles(at_rest, triangles, what, "give it some height", least_height=_LEAST_HEIGHT)
+    _require_apart(at_rest, triangles, what)
     direction = np.array([1.0, 0.0, 0.0]) if warp is None else finite_array(warp, f"{where}: warp", (3,))
     length = float(np.linalg.norm(direction))
     if length < _SHORTEST_DIRECTION:
@@ -95,6 +103,71 @@ def _require_sheet(vertices: FloatArray, triangles: IntArray, where: str) -> Non
             f"{unique[first].tolist()} ({np.count_nonzero(count > 2)} such edges), and a cloth has at most two there; "
             "remove the others, or add them as a cloth of their own"
         )
+
+
+def _require_apart(rest: FloatArray, triangles: IntArray, what: str) -> None:
+    """At rest no vertex on the edge or face of a triangle not its own: contact could not tell them apart."""
+    vertices, faces = _vertices_on_triangles(rest, triangles)
+    if len(vertices) == 0:
+        return
+    vertex, face = int(vertices[0]), int(faces[0])
+    count = len(np.unique(vertices))
+    others = "" if count == 1 else f" ({count} vertices lie on triangles of others)"
+    corners = triangles[face].tolist()
+    for k in range(3):
+        start, end, across = (corners[(k + i) % 3] for i in range(3))
+        length = float(np.linalg.norm(rest[end] - rest[start]))
+        if segment_segment_distance(rest[vertex], rest[vertex], rest[start], rest[end]) <= _TOUCHING * length:
+            raise ValueError(
+                f"{what} vertex {vertex} lies on the edge of vertices [{start}, {end}] but is no corner of their "
+                f"triangle {face}{others}: at such a T-junction the cloth is not joined, and it would touch itself at "
+                f"rest; replace triangle {face} by [{start}, {vertex}, {across}] and [{vertex}, {end}, {across}]"
+            )
+    raise ValueError(
+        f"{what} vertex {vertex} lies on triangle {face} of vertices {corners}{others}, so that the cloth would touch "
+        "itself at rest; move it off the triangle by the cloth's thickness, or make it a corner of triangles there"
+    )
+
+
+def _vertices_on_triangles(vertices: FloatArray, triangles: IntArray) -> tuple[Indices, Indices]:
+    """Vertices that lie on triangles they are no corners of, and these triangles, in the order of the vertices."""
+    corners = vertices[triangles]
+    reach = _TOUCHING * np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    low, high = corners.min(axis=1) - reach[:, None], corners.max(axis=1) + reach[:, None]
+    face, vertex = _sharing_cells(vertices, low, high)
+    near = ((vertices[vertex] >= low[face]) & (vertices[vertex] <= high[face])).all(axis=1)
+    near &= (triangles[face] != vertex[:, None]).all(axis=1)
+    vertex, face = vertex[near], face[near]
+    touching = point_triangle_distance(vertices[vertex], corners[face]) <= reach[face]
+    vertex, face = vertex[touching], face[touching]
+    sequence = np.lexsort((face, vertex))
+    return vertex[sequence], face[sequence]
+
+
+def _sharing_cells(points: FloatArray, low: FloatArray, high: FloatArray) -> tuple[Indices, Indices]:
+    """Pairs of a box (low, high) and a point in one of the cells it covers, of a grid across the two longest sides."""
+    axes = np.argsort(np.ptp(points, axis=0))[1:]
+    origin = low.min(axis=0)[axes]
+    points, low, high = points[:, axes] - origin, low[:, axes] - origin, high[:, axes] - origin
+    cell = float(np.median((high - low).max(axis=1)))
+    while True:
+        first = np.floor(low / cell).astype(np.int64)
+        size = np.floor(high / cell).astype(np.int64) - first + 1
+        count = size.prod(axis=1)
+        if count.sum() <= _CELLS_A_BOX * len(low):
+            break
+        cell *= 2.0  # some boxes are much larger than most
+    box = np.repeat(np.arange(len(low)), count)
+    within = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
+    stride = int((first + size).max()) + 2
+    key = (first[box, 0] + within % size[box, 0]) * stride + first[box, 1] + within // size[box, 0]
+    place = np.floor(points / cell).astype(np.int64)
+    own = place[:, 0] * stride + place[:, 1]
+    order = np.argsort(own, kind="stable")
+    begin, end = (np.searchsorted(own[order], key, side=side) for side in ("left", "right"))
+    box = np.repeat(box, end - begin)
+    within = np.arange(len(box)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
+    return box, order[np.repeat(begin, end - begin) + within]
 
 
 def _pinned_nodes(pinned: Any, count: int, where: str) -> NDArray[np.uint8]:

@@ -83,10 +83,11 @@ class Scene:
 
         A dynamic body needs either `density` or `mass`, and a closed mesh to distribute it over; with both `mass` and
         `inertia` the mesh may be open, and its frame's origin is taken for the centre of mass. If all faces of a closed
-        mesh point inwards they are turned around. A mesh of several parts must not count volume twice: its parts may
-        touch, and one whose faces point inwards is a cavity of the part around it, but they must not overlap, repeat
-        or contain one another; with both `mass` and `inertia` they may, as an open mesh. Static and kinematic bodies need none of this: their mesh may be open
-        (a terrain, whose frame's origin then serves as centre of mass), or closed with its faces inwards (a room).
+        mesh point inwards they are turned around. No volume may count twice: parts of a mesh may touch, and one whose
+        faces point inwards is a cavity of the part around it, but they must not overlap, repeat or contain one another
+        (with both `mass` and `inertia` they may, and are treated as an open mesh). Static and kinematic bodies need
+        none of this: their mesh may be open (a terrain, whose frame's origin then serves as centre of mass), or closed
+        with its faces inwards (a room).
 
         Args:
             mesh: A path trimesh can read (vertices at the same place become one), a `trimesh.Trimesh`, or (vertices,
@@ -202,7 +203,8 @@ class Scene:
         """Add a cloth: a sheet whose nodes are the vertices of a triangle mesh, in the mesh's order.
 
         The mesh need not be closed, flat or connected. What it must be is a sheet: at most two triangles at an edge,
-        every vertex in a triangle, no two vertices at the same place. `shapes.sheet` makes rectangular ones.
+        every vertex in a triangle, no two vertices at the same place, none on an edge or face it is no corner of (a
+        T-junction). `shapes.sheet` makes rectangular ones.
 
         Args:
             mesh: A path trimesh can read (vertices the file repeats at the same place become one), a

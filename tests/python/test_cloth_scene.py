@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from diffsim import ClothMaterial, shapes
-from diffsim.rotation import from_rpy, rotate
+from diffsim import ClothMaterial, _cloth_shape, shapes
+from diffsim.rotation import from_rpy, rotate, to_matrix
 from diffsim.scene import ClothHandle, PackedScene, Scene
 
 SHEET = shapes.sheet((1.0, 0.5), (5, 4))
@@ -416,3 +416,60 @@ def test_validation_needs_the_arrays_of_the_same_cloths() -> None:
     scene.add_cloth(SHEET)
     with pytest.raises(ValueError, match="validate: the packed arrays are of another scene"):
         scene.validate(packed)
+
+
+# ---- Touching at rest -------------------------------------------------------------------------------------------
+
+# A square whose right half is split at (1, 0.5) and whose left half is not: vertex 6 lies on the edge of 1 and 3.
+T_JUNCTION = (
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0], [2, 1, 0], [1, 0.5, 0]], dtype=float),
+    np.array([[0, 1, 2], [1, 3, 2], [1, 4, 6], [4, 5, 6], [6, 5, 3]]),
+)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_t_junction_is_refused_by_vertex_and_edge(dtype: type) -> None:
+    vertices, faces = T_JUNCTION
+    turn = to_matrix(from_rpy((0.3, 0.4, 0.5)))
+    for placed in (vertices, (vertices @ np.asarray(turn).T + [3.0, -2.0, 1.0]).astype(dtype), 1e-3 * vertices):
+        with pytest.raises(
+            ValueError, match=r"cloth 'flag': mesh vertex 6 lies on the edge of vertices \[1, 3\]"
+        ) as raised:
+            Scene().add_cloth((placed, faces), name="flag")
+        assert "replace triangle 1 by [1, 6, 2] and [6, 3, 2]" in str(raised.value)
+    mended = np.concatenate([faces[[0, 2, 3, 4]], [[1, 6, 2], [6, 3, 2]]])
+    Scene().add_cloth((vertices, mended))
+
+
+def test_a_vertex_on_a_face_is_refused_in_the_rest_shape_only() -> None:
+    vertices, faces = joined_sheets(0.0)
+    with pytest.raises(ValueError, match=r"mesh vertex \d+ lies on triangle \d+ of vertices .* touch itself at rest"):
+        Scene().add_cloth((vertices, faces))
+    apart = joined_sheets(0.1)[0]
+    Scene().add_cloth((vertices, faces), rest=apart)  # touches where it starts, and is moved apart there
+    with pytest.raises(ValueError, match=r"rest shape vertex \d+ lies on triangle"):
+        Scene().add_cloth((apart, faces), rest=vertices)
+
+
+def joined_sheets(gap: float) -> shapes.Mesh:
+    """A small sheet above a larger one, in one mesh."""
+    (below, faces), (above, patch) = shapes.sheet(1.0, 5), shapes.sheet(0.31, 3)
+    return np.concatenate([below, above + np.array([0.03, 0.02, gap])]), np.concatenate([faces, patch + len(below)])
+
+
+def test_sheets_of_any_size_do_not_touch_themselves() -> None:
+    for size, nodes in ((1e-3, 20), (1.0, (70, 3)), ((50.0, 1.0), (2, 40))):
+        Scene().add_cloth(shapes.sheet(size, nodes))
+    Scene().add_cloth(shapes.icosphere(0.5, 3))
+
+
+def test_vertices_on_triangles_are_found_among_triangles_of_all_sizes() -> None:
+    rng = np.random.default_rng(3)
+    size = 10.0 ** rng.uniform(-3, 0, size=(60, 1, 1))
+    corners = rng.uniform(-1, 1, size=(60, 1, 3)) + size * rng.normal(size=(60, 3, 3))
+    weights = rng.dirichlet(np.ones(3), size=60)
+    on = np.einsum("kw,kwi->ki", weights, corners)[:20]  # a point on each of the first
+    others = on[:, None] + 0.1 * rng.normal(size=(20, 2, 3))
+    corners = np.concatenate([corners, np.concatenate([on[:, None], others], axis=1)])
+    found = _cloth_shape._vertices_on_triangles(corners.reshape(-1, 3), np.arange(240).reshape(-1, 3))
+    np.testing.assert_array_equal(found, [180 + 3 * np.arange(20), np.arange(20)])
