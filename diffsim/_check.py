@@ -93,6 +93,12 @@ def check_state(where: str, state: Any, body_count: int, node_count: int) -> int
     for name, value in state.__dict__.items():
         count, width = (node_count if name.startswith("node") else body_count), (4 if name == "orientation" else 3)
         tensor = check_float_tensor(where, f"state.{name}", value, dtype)
+        if tensor.ndim in (2, 3) and tensor.shape[-2] != count and tensor.shape[-1] == width:
+            bodies = "1 body" if body_count == 1 else f"{body_count} bodies"
+            must = f"have shape ({count}, {width}) or (B, {count}, {width})"
+            text = message(where, f"state.{name}", must, tuple(tensor.shape))
+            nodes = f"{node_count} cloth nodes" if node_count else "no cloth"
+            raise ValueError(f"{text}; is it of another scene? This one has {bodies} and {nodes}")
         batch = check_shape(where, f"state.{name}", tensor, (count, width), batch)
     return batch
 

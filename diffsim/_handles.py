@@ -32,8 +32,7 @@ class BodyCount:
 class ClothHandle:
     """A cloth of a scene: `state.node_position[..., sheet.nodes, :]`, `sim.cloth_bend[sheet.cloth]`.
 
-    As an index it counts in the axis of objects, bodies first: `sim.friction[sheet]`. Adding more bodies to the scene
-    moves it, so convert it to an int when the scene is complete.
+    It is no index by itself: a cloth has a place in three axes, and a tensor cannot tell which one is meant.
     """
 
     __slots__ = ("_body_count", "cloth", "name", "nodes")
@@ -48,11 +47,15 @@ class ClothHandle:
         self.name = name
         self._body_count = body_count
 
-    def __index__(self) -> int:
+    def __int__(self) -> int:
+        """Index in the axis of objects, bodies first: `sim.friction[int(sheet)]`. Adding more bodies moves it."""
         return self._body_count.value + self.cloth
 
-    def __int__(self) -> int:
-        return self.__index__()
+    def __index__(self) -> int:  # torch and numpy drop the message, but refuse the index
+        raise TypeError(
+            f"{self!r} is no index: use its .cloth in the axis of cloths (sim.cloth_bend[sheet.cloth]), its .nodes in "
+            "that of nodes, its int() in that of objects (sim.friction[int(sheet)])"
+        )
 
     def __repr__(self) -> str:
         return f"ClothHandle({int(self)}, {self.name!r}, nodes {self.nodes.start}:{self.nodes.stop})"

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from . import _core, _energies
 from ._check import check_instance, check_state
 from ._cloth_energy import ClothElements, elastic_energy, node_mass
+from ._handles import BodyHandle, ClothHandle
 from ._packed import PackedScene
 from .state import State
 
@@ -144,21 +145,22 @@ class Measurements(nn.Module):
         leading = torch.broadcast_shapes(of_bodies.shape[:-2], nodes.shape[:-2])
         return torch.cat([t.expand(*leading, *t.shape[-2:]) for t in (of_bodies, nodes)], dim=-2)
 
-    def mesh(self, state: State, handle: SupportsIndex) -> trimesh.Trimesh:
+    def mesh(self, state: State, handle: SupportsIndex | ClothHandle) -> trimesh.Trimesh:
         """The surface of one object in the world, without its margin; spheres and capsules with facets.
 
         Args:
             state: Without leading axes.
             handle: As returned by `add_body` or `add_cloth`, or the index of an object, bodies first.
         Returns: Vertices in world axes [m], faces as they were given to the scene.
-        Raises: ValueError for a state with leading axes, IndexError for an object there is not.
+        Raises: ValueError for a state with leading axes or a handle of another scene, IndexError for an object there is
+            not.
         Gradients: none.
         """
         import trimesh
 
         self._check_state("mesh", state)
         p = self._packed
-        body = range(self._body_count + len(p.cloth_names))[handle]
+        body = self._object("mesh", handle)
         if state.leading_shape:
             raise ValueError(f"mesh: state must be one state, got leading axes {tuple(state.leading_shape)}; index it")
         if body >= self._body_count:
@@ -228,6 +230,17 @@ class Measurements(nn.Module):
 
     def _node_mass(self) -> Tensor | None:
         return None if self._elements is None else node_mass(self._elements, self.cloth_density.to(torch.float64))
+
+    def _object(self, where: str, handle: SupportsIndex | ClothHandle) -> int:
+        """The index of an object, bodies first; a handle must be of an object of that name here."""
+        names = [*self._packed.names, *self._packed.cloth_names]
+        if not isinstance(handle, (BodyHandle, ClothHandle)):
+            return range(len(names))[handle]
+        index = int(handle) if isinstance(handle, BodyHandle) else self._body_count + handle.cloth
+        if names[index : index + 1] != [handle.name]:
+            here = f"object {index} is {names[index]!r}" if index < len(names) else f"there are {len(names)} objects"
+            raise ValueError(f"{where}: {handle!r} is of another scene, or was added later: {here} here")
+        return index
 
     def _check_state(self, where: str, state: Any) -> None:
         """As `check_state`, with any number of leading axes."""

@@ -19,6 +19,7 @@ from ._check import (
 )
 from ._cloth_energy import cloth_elements
 from ._description import description
+from ._identity import SceneIdentity
 from ._inputs import Controls, Inputs, check_unused, checked_inputs, plain_inputs, state_from
 from ._measurements import Measurements
 from ._outcome import combined, failure_text, warn_of_failure, warn_of_fast_impacts
@@ -36,7 +37,7 @@ _CLOTH_ITERATIONS = 2000  # stiff cloth at large time steps crumples slowly
 _PROGRESS_UPDATES = 100  # of a rollout that is not cut into segments for checkpointing
 
 
-class Simulator(Measurements):
+class Simulator(SceneIdentity, Measurements):
     """Advances a scene by time steps of `dt`; differentiable, deterministic, without memory from one call to the next.
 
     Each step minimizes the distance to the free motion, in the metric of the masses, subject to surfaces keeping their

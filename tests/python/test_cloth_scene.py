@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffsim import ClothMaterial, _cloth_shape, shapes
+from diffsim import ClothMaterial, Simulator, _cloth_shape, shapes
 from diffsim.rotation import from_rpy, rotate, to_matrix
 from diffsim.scene import ClothHandle, PackedScene, Scene
 
@@ -217,12 +217,25 @@ def test_handle_indexes_nodes_cloths_and_objects() -> None:
     assert (sheet.name, sheet.cloth, sheet.nodes, int(sheet)) == ("sheet", 1, slice(20, 40), 2)
     assert repr(sheet) == "ClothHandle(2, 'sheet', nodes 20:40)"
     friction = torch.arange(8.0).reshape(2, 4)
-    assert torch.equal(friction[..., sheet], torch.tensor([2.0, 6.0]))
-    assert np.arange(4.0)[sheet] == [0, 1, 2, 3][sheet] == 2
+    assert torch.equal(friction[..., int(sheet)], torch.tensor([2.0, 6.0]))
     nodes = torch.arange(120.0).reshape(40, 3)
     assert torch.equal(nodes[..., sheet.nodes, :], nodes[20:])
     scene.add_sphere(0.1, mass=1.0)
     assert int(sheet) == 3  # behind all bodies
+
+
+def test_handle_of_a_cloth_is_no_index_since_no_tensor_knows_which_axis_is_meant() -> None:
+    scene = Scene()
+    scene.add_cloth(SHEET, ClothMaterial(bend=1.0))
+    sheet = scene.add_cloth(SHEET, ClothMaterial(bend=2.0), position=(0, 0, 3), name="sheet")
+    sim, values = Simulator(scene, dt=0.01), np.arange(40.0)
+    for tensor in (sim.cloth_bend, sim.friction, sim.initial_state().node_position, values):
+        for index in (sheet, (..., sheet), slice(sheet, None)):
+            with pytest.raises((IndexError, TypeError)):
+                tensor[index]
+    with pytest.raises(TypeError, match=r"'sheet'.* is no index: use its \.cloth .* \.nodes .* int\(\)"):
+        range(9)[sheet]
+    assert sim.cloth_bend[sheet.cloth] == 2.0
 
 
 def test_handles_pickle_and_copy_with_their_scene() -> None:
