@@ -3,6 +3,7 @@
 from typing import Any
 
 from . import diagnostics, rotation, shapes
+from ._units import UnitsWarning
 from .materials import ClothMaterial
 from .ops import ConvergenceWarning, FastImpactWarning, Info, SolverError
 from .scene import BodyHandle, ClothHandle, Scene
@@ -21,6 +22,7 @@ __all__ = [
     "Simulator",
     "SolverError",
     "State",
+    "UnitsWarning",
     "diagnostics",
     "rotation",
     "shapes",

@@ -26,6 +26,7 @@ class Shape:
     inertia: FloatArray
     closed: bool
     margin: float | None
+    density: float | None = None  #: of a dynamic body, on average; None where the mesh encloses no volume  [kg/m³]
 
 
 def mesh_shape(
@@ -44,13 +45,13 @@ def mesh_shape(
         raise ValueError(_NO_MASS.format(where=where))
     try:
         faces = require_solid(vertices, faces, where)
-        properties = mesh_mass_properties(vertices, faces)
     except ValueError:
         if mass is None or inertia is None:
             raise
-        properties = MassProperties(1.0, np.zeros(3), inertia / mass)  # all of it is given, but for the centre
+        return Shape(vertices, faces, np.zeros(3), mass, inertia, closed, margin)
+    properties = mesh_mass_properties(vertices, faces)
     mass, inertia = _scaled(properties, density, mass, inertia)
-    return Shape(vertices, faces, properties.center, mass, inertia, closed, margin)
+    return Shape(vertices, faces, properties.center, mass, inertia, closed, margin, mass / properties.mass)
 
 
 def round_shape(
@@ -70,7 +71,7 @@ def round_shape(
     if density is None and mass is None:
         raise ValueError(_NO_MASS.format(where=where))
     mass, inertia = _scaled(properties, density, mass, inertia)
-    return replace(shape, mass=mass, inertia=inertia)
+    return replace(shape, mass=mass, inertia=inertia, density=mass / properties.mass)
 
 
 def _mass_arguments(density: Any, mass: Any, inertia: Any, where: str) -> tuple[float | None, float | None, Any]:

@@ -37,16 +37,17 @@ class ClothShape:
     smallest_height: float  #: of the triangles, at rest or at the start, over their longest edge [m]
 
 
-def cloth_shape(mesh: Any, rest: Any, warp: Any, pinned: Any, where: str) -> ClothShape:
+def cloth_shape(mesh: Any, rest: Any, warp: Any, pinned: Any, scale: float, where: str) -> ClothShape:
     """Check everything that is given.
 
     Raises: TypeError, ValueError naming the object, what is wrong, and the mend.
     """
     vertices, triangles = read_mesh_in_order(mesh, where)
     _require_sheet(vertices, triangles, where)
+    vertices *= scale
     at_rest = vertices.copy()
     if rest is not None:
-        at_rest = finite_array(rest, f"{where}: rest", vertices.shape)
+        at_rest = scale * finite_array(rest, f"{where}: rest", vertices.shape)
     what = f"{where}: {'mesh' if rest is None else 'rest shape'}"
     check_triangles(at_rest, triangles, what, "give it some height", least_height=_LEAST_HEIGHT)
     _require_apart(at_rest, triangles, what)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,12 @@ from ._mass_properties import capsule_mass_properties, sphere_mass_properties
 from ._mesh import read_mesh
 from ._packed import Body, Cloth, Ground, PackedScene, pack_scene, rotation_matrix
 from ._surfaces import Solid
+from ._units import UnitsWarning, density_slip, require_resolvable_cloth, size_slip
 from .materials import ClothMaterial
 
 __all__ = ["BodyHandle", "ClothHandle", "PackedScene", "Scene"]
+
+_SCALE_MEND = "for a mesh in other units give scale=, the metres in one of them (0.001 for millimetres)"
 
 
 class Scene:
@@ -40,6 +44,7 @@ class Scene:
         self._body_count = BodyCount()  # cloth handles hold on to it
         self._names: set[str] = set()
         self._ground: Ground | None = None
+        self._warned_of_units = False
 
     def add_ground(
         self, height: float = 0.0, friction: float = 0.0, restitution: float = 0.0, margin: float | None = None
@@ -77,6 +82,7 @@ class Scene:
         friction: float = 0.0,
         restitution: float = 0.0,
         margin: float | None = None,
+        scale: float = 1.0,
         name: str | None = None,
     ) -> BodyHandle:
         """Add a rigid body whose surface is a triangle mesh, convex or not.
@@ -103,6 +109,8 @@ class Scene:
             friction: 0; contact is frictionless for now.
             restitution: 0; contact is inelastic for now.
             margin: Distance of the collision surface from the mesh [m]. Default: half of the simulator's thickness.
+            scale: Metres in a unit of the mesh: 0.001 for a mesh in millimetres. Vertices are multiplied with it before
+                anything is made of them; all other arguments are in SI units and are not.
             name: For error messages and pictures, unique. Default: "body_" and its index.
         Returns: A handle that is the body's index.
         Raises:
@@ -110,13 +118,16 @@ class Scene:
             TypeError: An argument of the wrong type.
             FileNotFoundError: The mesh's file.
             NotImplementedError: Friction or restitution other than 0.
+        Warns: UnitsWarning, once per scene, of a dynamic body or a cloth longer than 100 m or shorter than 0.1 mm, or a
+            dynamic body of less than 5 kg/m³: most of these are slips of units.
         """
         where, name = self._name(name, "body", len(self._bodies))
         kind = body_kind(kind, where)
         vertices, faces = read_mesh(mesh, where)
+        vertices *= positive(scale, f"{where}: scale", "m per unit of the mesh")
         shape = mesh_shape(vertices, faces, density, mass, inertia, kind, margin, where)
         motion = (position, orientation, velocity, angular_velocity)
-        return self._add(name, where, kind, shape, motion, friction, restitution)
+        return self._add(name, where, kind, shape, motion, friction, restitution, _SCALE_MEND)
 
     def add_sphere(
         self,
@@ -136,7 +147,7 @@ class Scene:
     ) -> BodyHandle:
         """Add an exact sphere: one vertex with a margin of `radius`. Solid, unless `inertia` says otherwise.
 
-        The radius [m] takes the place of `add_body`'s margin; all other arguments are as there.
+        The radius [m] takes the place of `add_body`'s mesh, margin and scale; all other arguments are as there.
 
         Returns: A handle that is the body's index.
         Raises: As `add_body`; ValueError for a radius that is not positive.
@@ -147,7 +158,7 @@ class Scene:
         properties = sphere_mass_properties(radius)
         shape = round_shape(np.zeros((1, 3)), radius, properties, density, mass, inertia, kind, where)
         motion = (position, orientation, velocity, angular_velocity)
-        return self._add(name, where, kind, shape, motion, friction, restitution)
+        return self._add(name, where, kind, shape, motion, friction, restitution, "a radius is given in them")
 
     def add_capsule(
         self,
@@ -168,8 +179,8 @@ class Scene:
     ) -> BodyHandle:
         """Add an exact capsule about the body's z axis: two vertices `length` apart with a margin of `radius`.
 
-        Its length from end to end is `length + 2 radius` [m]. Solid, unless `inertia` says otherwise. The radius takes
-        the place of `add_body`'s margin; all other arguments are as there.
+        Its length from end to end is `length + 2 radius` [m]. Solid, unless `inertia` says otherwise. The radius and
+        the length take the place of `add_body`'s mesh, margin and scale; all other arguments are as there.
 
         Returns: A handle that is the body's index.
         Raises: As `add_body`; ValueError for a radius or length that is not positive.
@@ -182,7 +193,7 @@ class Scene:
         properties = capsule_mass_properties(radius, length)
         shape = round_shape(ends, radius, properties, density, mass, inertia, kind, where)
         motion = (position, orientation, velocity, angular_velocity)
-        return self._add(name, where, kind, shape, motion, friction, restitution)
+        return self._add(name, where, kind, shape, motion, friction, restitution, "a radius is given in them")
 
     def add_cloth(
         self,
@@ -196,6 +207,7 @@ class Scene:
         rest: Any = None,
         warp: Any = None,
         margin: float | None = None,
+        scale: float = 1.0,
         friction: float = 0.0,
         restitution: float = 0.0,
         name: str | None = None,
@@ -221,6 +233,7 @@ class Scene:
                 it lies in its plane. Default: the x axis.
             margin: Distance of the collision surface from the mesh, to both sides [m]: half of the cloth's thickness.
                 Default: half of the simulator's thickness.
+            scale: Metres in a unit of the mesh, and of `rest`, as for `add_body`.
             friction: 0, as for `add_body`.
             restitution: 0, as for `add_body`.
             name: For error messages and pictures, unique. Default: "cloth_" and its index.
@@ -230,15 +243,17 @@ class Scene:
             TypeError: An argument of the wrong type.
             FileNotFoundError: The mesh's file.
             NotImplementedError: Friction or restitution other than 0.
+        Warns: UnitsWarning, as `add_body`.
         """
         where, name = self._name(name, "cloth", len(self._cloths))
+        scale = positive(scale, f"{where}: scale", "m per unit of the mesh")
         if material is None:
             material = ClothMaterial()
         if not isinstance(material, ClothMaterial):
             raise TypeError(f"{where}: material must be a diffsim.ClothMaterial, got {type(material).__name__}")
         cloth = Cloth(
             name=name,
-            shape=cloth_shape(mesh, rest, warp, pinned, where),
+            shape=cloth_shape(mesh, rest, warp, pinned, scale, where),
             material=material,
             position=finite_array(position, f"{where}: position", (3,)),
             orientation=unit_quaternion(orientation, where),
@@ -247,6 +262,7 @@ class Scene:
             friction=unavailable(friction, "friction", where),
             restitution=unavailable(restitution, "restitution", where),
         )
+        self._warn_of_units(size_slip(where, float(np.ptp(cloth.shape.rest, axis=0).max()), _SCALE_MEND), 3)
         first = sum(len(c.shape.vertices) for c in self._cloths)
         self._cloths.append(cloth)
         self._names.add(name)
@@ -273,16 +289,18 @@ class Scene:
         The surfaces that must not overlap are the meshes, offset by their margin where one was given. Touching, and
         being nearer than the thickness, is fine; so is overlap up to 1e-9 of the smaller object's size, which is
         rounding. Static and kinematic bodies may overlap each other and the ground. A cloth must neither cross another
-        surface nor lie inside a closed body, and must not cross itself.
+        surface nor lie inside a closed body, must not cross itself, and must not be so small and stiff that rounding
+        bends it with more force than its weight.
 
         Args:
             packed: What `pack` returned for this scene; its positions and orientations may have been replaced.
-        Raises: ValueError naming the pair that overlaps most and how deep, and how many more there are; ValueError if
-            `packed` is not of this scene.
+        Raises: ValueError naming the pair that overlaps most and how deep, and how many more there are; ValueError
+            naming a cloth that is too small; ValueError if `packed` is not of this scene.
         """
         names = [body.name for body in self._bodies], [cloth.name for cloth in self._cloths]
         if (packed.names, packed.cloth_names) != names:
             raise ValueError("validate: the packed arrays are of another scene, or objects were added since pack()")
+        require_resolvable_cloth(packed)
         solids = self._solids(packed)
         ground_radius = (self._ground.margin or 0.0) if self._ground else 0.0
         overlaps = find_overlaps(solids, packed.ground_height if packed.has_ground else None, ground_radius)
@@ -342,6 +360,7 @@ class Scene:
         motion: tuple[Any, Any, Any, Any],
         friction: float,
         restitution: float,
+        units_mend: str,
     ) -> BodyHandle:
         position, orientation, velocity, angular_velocity = motion
         body = Body(
@@ -363,10 +382,21 @@ class Scene:
                         f"{where}: {field} must be zero for a static body, got {value.tolist()}; use kind='kinematic' "
                         "for a body that moves as told"
                     )
+        if kind == "dynamic":
+            extent = float(np.ptp(shape.vertices, axis=0).max()) + 2.0 * (shape.margin or 0.0)
+            slip = size_slip(where, extent, units_mend)
+            if slip is None and shape.density is not None:
+                slip = density_slip(where, shape.density, units_mend)
+            self._warn_of_units(slip, 4)
         self._bodies.append(body)
         self._body_count.value += 1
         self._names.add(name)
         return BodyHandle(len(self._bodies) - 1, name)
+
+    def _warn_of_units(self, text: str | None, level: int) -> None:
+        if text is not None and not self._warned_of_units:
+            self._warned_of_units = True
+            warnings.warn(text, UnitsWarning, stacklevel=level)  # the line that adds the object
 
     def _solids(self, packed: PackedScene) -> list[Solid]:
         solids = []

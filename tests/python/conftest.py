@@ -7,6 +7,11 @@ import pytest
 import torch
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Many scenes are of 1 or 2 kg/m³, for round numbers."""
+    config.addinivalue_line("filterwarnings", "ignore::diffsim.UnitsWarning")
+
+
 def pytest_report_header() -> str:
     """Name the copy of diffsim under test: the installed one, unless PYTHONPATH says otherwise."""
     spec = find_spec("diffsim")
