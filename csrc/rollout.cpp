@@ -82,13 +82,15 @@ void require_finite(const char* field, const Model& model, int body, const Vecto
     if (!value.allFinite()) refuse(field, model, body, "must be finite, got (" + text_of(value) + ")");
 }
 
-[[noreturn]] void refuse_node(const std::string& field, const Model& model, int node, const Vec3& value) {
+[[noreturn]] void refuse_node(
+    const std::string& field, const Model& model, int node, const std::string& problem, const Vec3& value,
+    const std::string& mend = "") {
     std::size_t cloth = 0;
     while (node >= model.cloths[cloth].first_node + model.cloths[cloth].node_count()) ++cloth;
     throw std::invalid_argument(
         field + " of node " + std::to_string(node - model.cloths[cloth].first_node) + " of cloth '" +
-        model.cloths[cloth].name + "' (index " + std::to_string(node) + ") must be finite, got (" + text_of(value) +
-        ")");
+        model.cloths[cloth].name + "' (index " + std::to_string(node) + ") " + problem + ", got (" + text_of(value) +
+        ")" + mend);
 }
 
 /// One row per node; zeros where nothing is given.
@@ -99,7 +101,7 @@ void read_nodes(
     if (!view.present()) return;
     for (int i = 0; i < model.node_count(); ++i) {
         nodes[i] = row<3>(view.at(time, scene), i);
-        if (!nodes[i].allFinite()) refuse_node(field, model, i, nodes[i]);
+        if (!nodes[i].allFinite()) refuse_node(field, model, i, "must be finite", nodes[i]);
     }
 }
 
@@ -185,30 +187,53 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
     return parameters;
 }
 
+constexpr const char* kKindNames[] = {"dynamic", "static", "kinematic"};
+constexpr const char* kPushMend = "only a body of kind='dynamic' can be pushed";
+constexpr const char* kDriveMend =
+    "only a body of kind='kinematic' can be driven; the velocity of any other is given to the state";
+
 void read_control(
     const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state, Workers& workers,
     SceneControl& control) {
     control.bodies.resize(model.bodies.size());
-    const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise) {
+    // A value that nothing would read is a mistake; zeros are what is given for bodies that are not meant.
+    const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise,
+                          bool is_read, const char* mend) {
         if (!view.present()) return otherwise;
         const Vec3 value = row<3>(view.at(time, scene), body);
         require_finite(field, model, body, value);
+        if (!is_read && !value.isZero(0.0))
+            refuse(
+                field, model, body,
+                "must be zero, because the body is " +
+                    std::string(kKindNames[static_cast<int>(model.bodies[body].kind)]) + ", got (" + text_of(value) +
+                    "); " + mend);
         return value;
     };
     const Vec3 zero = Vec3::Zero();
     workers.for_each_range(model.body_count(), kBodiesARange, [&](int begin, int end, int) {
         for (int i = begin; i < end; ++i) {
+            const bool pushed = model.bodies[i].is_dynamic(), driven = model.bodies[i].kind == BodyKind::kinematic;
+            const BodyState& now = state.bodies[i];
             BodyControl& body = control.bodies[i];
-            body.force = read("control.force", in.force, i, zero);
-            body.torque = read("control.torque", in.torque, i, zero);
-            body.velocity = read("control.body_velocity", in.body_velocity, i, state.bodies[i].velocity);
-            body.angular_velocity =
-                read("control.body_angular_velocity", in.body_angular_velocity, i, state.bodies[i].angular_velocity);
+            body.force = read("control.force", in.force, i, zero, pushed, kPushMend);
+            body.torque = read("control.torque", in.torque, i, zero, pushed, kPushMend);
+            body.velocity = read("control.body_velocity", in.body_velocity, i, now.velocity, driven, kDriveMend);
+            body.angular_velocity = read(
+                "control.body_angular_velocity", in.body_angular_velocity, i, now.angular_velocity, driven, kDriveMend);
         }
     });
     if (model.cloths.empty()) return;
     read_nodes("control.node_force", model, in.node_force, time, scene, control.node_force);
     read_nodes("control.node_velocity", model, in.node_drive, time, scene, control.node_velocity);
+    if (!in.node_drive.present()) return;
+    for (const Cloth& cloth : model.cloths)
+        for (int i = 0; i < cloth.node_count(); ++i)
+            if (!cloth.pinned[i] && !control.node_velocity[cloth.first_node + i].isZero(0.0))
+                refuse_node(
+                    "control.node_velocity", model, cloth.first_node + i,
+                    "must be zero, because the node is not pinned", control.node_velocity[cloth.first_node + i],
+                    "; pin it (add_cloth: pinned=), or give its velocity to the state");
 }
 
 void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene, Workers& workers) {

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from . import _core
+from ._arguments import KINDS
 from ._check import (
     CLOTH_PARAMETERS,
     CONTROL_FIELDS,
@@ -314,4 +315,8 @@ def _direction(name: str, inputs: dict[str, Tensor], sim: Simulator, generator: 
         return direction * (inputs["cloth_density"].mean() * sim._elements.node_area.mean()) / dt
     if name == "torque":
         return direction * _mean_inertia(inputs["inertia"]).unsqueeze(-1) / dt
+    if name in ("body_velocity", "body_angular_velocity"):  # of other bodies it must be zero
+        return direction * torch.from_numpy(sim._packed.kind == KINDS.index("kinematic"))[:, None]
+    if name == "node_drive":
+        return direction * torch.from_numpy(sim._packed.pinned)[:, None]
     return direction

@@ -149,15 +149,17 @@ class State(_TensorFields):
 class Control(_TensorFields):
     """What drives one step (or, with a leading time axis, a rollout); any field may be None, and then is zero.
 
+    Rows of bodies and nodes a field says nothing to must be zero: a step refuses a control that it would not read.
+
     Every tensor may carry one leading batch axis of its own. SI units, world frame, dtype of the state. Gradients reach
     all of them.
 
     Args:
-        force: At the centre of mass [N], shape (..., n_bodies, 3), constant over the step.
-        torque: About the centre of mass [N·m], shape (..., n_bodies, 3).
-        node_force: On cloth nodes [N], shape (..., n_nodes, 3).
-        body_velocity: Velocity of kinematic bodies [m/s], shape (..., n_bodies, 3); rows of other bodies are not
-            read. None: they go on with the velocity in their state.
+        force: On dynamic bodies at the centre of mass [N], shape (..., n_bodies, 3), constant over the step.
+        torque: On dynamic bodies about the centre of mass [N·m], shape (..., n_bodies, 3).
+        node_force: On cloth nodes [N], shape (..., n_nodes, 3). What holds a pinned node takes its force.
+        body_velocity: Velocity of kinematic bodies [m/s], shape (..., n_bodies, 3). None: they go on with the velocity
+            in their state.
         body_angular_velocity: Angular velocity of kinematic bodies [rad/s], shape (..., n_bodies, 3); same rules.
         node_velocity: Velocity of pinned nodes [m/s], shape (..., n_nodes, 3).
     """

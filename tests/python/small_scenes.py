@@ -44,3 +44,12 @@ def falling_box(**options: Any) -> ds.Simulator:
 def assert_same(a: ds.State, b: ds.State) -> None:
     for name in STATE_FIELDS:
         assert torch.equal(getattr(a, name), getattr(b, name)), name
+
+
+def only_read(sim: ds.Simulator, control: ds.Control) -> ds.Control:
+    """The control with zeros where nothing would read it: what is not zero there is refused."""
+    kind, pinned = torch.from_numpy(sim._packed.kind), torch.from_numpy(sim._packed.pinned)
+    reads = {"force": kind == 0, "torque": kind == 0, "body_velocity": kind == 2, "body_angular_velocity": kind == 2}
+    given = {name: getattr(control, name) for name in (*reads, "node_velocity")}
+    reads["node_velocity"] = pinned == 1
+    return control.replace(**{name: t * reads[name][:, None] for name, t in given.items() if t is not None})

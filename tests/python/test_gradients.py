@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_scenes import only_read
 from torch import Tensor
 
 import diffsim as ds
@@ -143,7 +144,7 @@ def controls_for(sim: ds.Simulator, state: ds.State, seed: int = 1) -> ds.Contro
             body_velocity=state.velocity + 0.05 * normal(state.velocity),
             body_angular_velocity=0.05 * normal(state.velocity),
         )
-    return control
+    return only_read(sim, control)
 
 
 def impacts(sim: ds.Simulator, state: ds.State, controls: ds.Control) -> float:

@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.utils._pytree as pytree
+from small_scenes import only_read
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vjp, vmap
 
@@ -14,6 +15,7 @@ import diffsim as ds
 from diffsim import _core
 
 STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
+PUSHED = torch.tensor([[1.0], [0.0]], dtype=torch.float64)  # of two bodies the dynamic one
 # Two ways to the same derivative sum in different orders.
 ROUNDING = 1e-12
 
@@ -52,7 +54,7 @@ def state(sim: ds.Simulator) -> ds.State:
 
 @pytest.fixture
 def force() -> Tensor:
-    return torch.randn(2, 3, dtype=torch.float64)
+    return PUSHED * torch.randn(2, 3, dtype=torch.float64)
 
 
 class Calls:
@@ -113,7 +115,7 @@ def test_gradcheck(make: Callable[[], ds.Simulator], keep_time: bool) -> None:
         state, control, values = inputs[:4], inputs[4:8], dict(zip(("mass", "inertia", "gravity"), inputs[8:]))
         module = RolloutModule(sim, keep_time)
         names = ("force", "torque", "body_velocity", "body_angular_velocity")
-        args = (ds.State(*state), ds.Control(**dict(zip(names, control))))
+        args = (ds.State(*state), only_read(sim, ds.Control(**dict(zip(names, control)))))
         return fields(functional_call(module, {f"sim.{k}": v for k, v in values.items()}, args))
 
     # Inertia is perturbed one entry at a time: only its symmetric part is read, so symmetric gradients are compared.
@@ -197,7 +199,7 @@ def test_each_gradient_alone_is_what_it_is_among_all(coupling: str) -> None:
     sim = ds.Simulator(scene, dt=0.01, coupling=coupling)
     state = sim.rollout(sim.initial_state(), None, 5)[-1]
     bodies, nodes = torch.zeros_like(state.position), torch.zeros_like(state.node_position)
-    control = ds.Control(bodies + 0.1, bodies - 0.1, nodes + 1e-3, bodies, bodies, nodes)
+    control = only_read(sim, ds.Control(bodies + 0.1, bodies - 0.1, nodes + 1e-3, bodies, bodies, nodes))
     sim(state)
     assert sim.info.contacts > 4
     paths, _ = pytree.tree_flatten_with_path((dict(sim.named_parameters()), state, control))
@@ -295,7 +297,7 @@ def test_vmap_equals_the_native_batch(make: Callable[[], ds.Simulator], calls: C
 @pytest.mark.parametrize("steps", [1, 3])
 def test_nested_vmap_over_a_native_batch(sim: ds.Simulator, steps: int) -> None:
     states = different_states(sim, 2, 3, 4)
-    forces = torch.randn(3, 2, 3, dtype=torch.float64)
+    forces = PUSHED * torch.randn(3, 2, 3, dtype=torch.float64)
 
     def run(state: ds.State, force: Tensor) -> ds.State:
         assert state.position.shape == (4, 2, 3)
@@ -310,7 +312,7 @@ def test_nested_vmap_over_a_native_batch(sim: ds.Simulator, steps: int) -> None:
 
 
 def test_vmap_over_any_axis_of_controls_with_time(sim: ds.Simulator, state: ds.State) -> None:
-    forces = torch.randn(5, 2, 3, 4, dtype=torch.float64)  # steps, bodies, xyz, mapped
+    forces = PUSHED[..., None] * torch.randn(5, 2, 3, 4, dtype=torch.float64)  # steps, bodies, xyz, mapped
 
     def run(force: Tensor) -> Tensor:
         return sim.rollout(state, ds.Control(force=force), 5).velocity
@@ -325,7 +327,7 @@ def test_vmap_of_grad_gives_one_gradient_each(sim: ds.Simulator) -> None:
 
     def loss(mass: Tensor, state: ds.State) -> Tensor:
         return functional_call(
-            sim, {"mass": mass}, (state, ds.Control(force=torch.ones_like(state.velocity)))
+            sim, {"mass": mass}, (state, ds.Control(force=PUSHED * torch.ones_like(state.velocity)))
         ).velocity.sum()
 
     mapped = vmap(grad(loss), in_dims=(None, 0))(mass, states)
@@ -335,7 +337,7 @@ def test_vmap_of_grad_gives_one_gradient_each(sim: ds.Simulator) -> None:
 
 
 def test_vmap_of_grad_over_a_native_batch_sums_over_it(sim: ds.Simulator) -> None:
-    states, force = different_states(sim, 3, 4), torch.randn(5, 2, 3, dtype=torch.float64)
+    states, force = different_states(sim, 3, 4), PUSHED * torch.randn(5, 2, 3, dtype=torch.float64)
 
     def loss(force: Tensor, state: ds.State) -> Tensor:
         return sim.rollout(state, ds.Control(force=force), 5).position.square().sum()
@@ -346,7 +348,7 @@ def test_vmap_of_grad_over_a_native_batch_sums_over_it(sim: ds.Simulator) -> Non
 
 
 def test_grad_of_vmap(sim: ds.Simulator) -> None:
-    states, force = different_states(sim, 3), torch.randn(2, 3, dtype=torch.float64)
+    states, force = different_states(sim, 3), PUSHED * torch.randn(2, 3, dtype=torch.float64)
 
     def loss(force: Tensor) -> Tensor:
         return vmap(lambda s: sim.rollout(s, ds.Control(force=force), 3).position)(states).square().sum()
@@ -375,7 +377,7 @@ def test_jacrev_rows_are_gradients(sim: ds.Simulator, state: ds.State, force: Te
 
 
 def test_jacrev_inside_vmap(sim: ds.Simulator) -> None:
-    states, force = different_states(sim, 3), torch.randn(2, 3, dtype=torch.float64)
+    states, force = different_states(sim, 3), PUSHED * torch.randn(2, 3, dtype=torch.float64)
 
     def run(force: Tensor, state: ds.State) -> Tensor:
         return sim(state, ds.Control(force=force)).position
