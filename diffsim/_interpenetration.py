@@ -36,6 +36,8 @@ GROUND = -1  #: stands for the ground in `Overlap.b`
 _TOUCH_SAMPLES = 512
 # How many points of each kind are tried to tell how deep a body reaches into another: the error message needs no more.
 _DEPTH_SAMPLES = 48
+# How many vertices are projected onto how many axes at most, to find the shortest shift that separates convex bodies.
+_MOST_PROJECTIONS = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,9 @@ class Overlap:
 
     a: int
     b: int
-    depth: float  #: how far below the surface of one the deepest point found of the other lies: a shift that separates
-    #: them is at least this long  [m]
+    depth: float  #: length of the shortest shift that separates them, where `exact`; else how far below the surface of
+    #: one the deepest point found of the other lies, and that shift is at least about this long  [m]
+    exact: bool
 
 
 def find_overlaps(solids: Sequence[Solid], ground_height: float | None, ground_radius: float) -> list[Overlap]:
@@ -60,12 +63,12 @@ def find_overlaps(solids: Sequence[Solid], ground_height: float | None, ground_r
     for a, b in candidate_pairs(solids):
         depth = _pair_depth(solids[a], solids[b])
         if depth > 0.0:
-            overlaps.append(Overlap(a, b, depth))
+            overlaps.append(Overlap(a, b, depth, _is_exact(solids[a], solids[b])))
     if ground_height is not None:
         for index, solid in enumerate(solids):
             depth = ground_height + ground_radius - float(solid.box[0][2])
             if solid.movable and depth > touching_depth(solid, solid):
-                overlaps.append(Overlap(index, GROUND, depth))
+                overlaps.append(Overlap(index, GROUND, depth, True))
     return sorted(overlaps, key=lambda overlap: (overlap.a, overlap.b == GROUND, overlap.b))
 
 
@@ -128,7 +131,43 @@ def _pair_depth(a: Solid, b: Solid) -> float:
     else:
         gap = segment_segment_distance(a.vertices[0], a.vertices[-1], b.vertices[0], b.vertices[-1])
         depth = a.radius + b.radius - float(gap)
+    if depth > tolerance and (len(a.faces) or len(b.faces)) and _is_exact(a, b):
+        shift = _least_shift(a, b)
+        if shift > tolerance:  # else it is their radii that overlap, which was measured
+            depth = shift + a.radius + b.radius
     return depth if depth > tolerance else 0.0
+
+
+def _is_exact(a: Solid, b: Solid) -> bool:
+    """Whether the depth of the two is the length of the shortest shift that separates them."""
+    axes = len(a.faces) + len(b.faces) + 9 * max(1, len(a.faces)) * max(1, len(b.faces)) // 4
+    return a.convex and b.convex and axes * (len(a.vertices) + len(b.vertices)) <= _MOST_PROJECTIONS
+
+
+def _least_shift(a: Solid, b: Solid) -> float:
+    """The shortest shift that separates two convex bodies, their radii left out; not positive if they are apart [m].
+
+    It is along a face's normal, or across an edge of each [the separating axis theorem].
+    """
+    edges_a, edges_b = _edge_directions(a), _edge_directions(b)
+    crossed = np.cross(edges_a[:, None], edges_b[None]).reshape(-1, 3)
+    length = np.linalg.norm(crossed, axis=1)
+    crossed = crossed[length > 1e-6] / length[length > 1e-6, None]  # of parallel edges it is rounding
+    axes = np.concatenate([*(unit_normals(solid.triangles) for solid in (a, b) if len(solid.faces)), crossed])
+    along_a, along_b = a.vertices @ axes.T, b.vertices @ axes.T
+    ahead, behind = along_a.max(axis=0) - along_b.min(axis=0), along_b.max(axis=0) - along_a.min(axis=0)
+    return float(np.minimum(ahead, behind).min())
+
+
+def _edge_directions(solid: Solid) -> FloatArray:
+    """Unit vectors along all edges, shape (k, 3)."""
+    if len(solid.faces):
+        pairs = np.stack([solid.faces, np.roll(solid.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+        pairs = pairs[pairs[:, 0] < pairs[:, 1]]  # each edge of a closed surface once
+    else:
+        pairs = np.array([[0, 1]])[: len(solid.vertices) - 1]
+    along = solid.vertices[pairs[:, 1]] - solid.vertices[pairs[:, 0]]
+    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
 
 def _segment_mesh_depth(segment: Solid, mesh: Solid) -> float:

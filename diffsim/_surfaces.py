@@ -24,6 +24,7 @@ _TOUCHING = 1e-9
 # Rounding of a world coordinate x is about eps |x|; a few such roundings meet in every distance.
 _ROUNDING = 64.0 * np.finfo(np.float64).eps
 _MAX_FACE_PAIRS = 200_000
+_MOST_CONVEX_FACES = 1000  # of a mesh that is tested for being convex
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,18 @@ class Solid:
     @cached_property
     def triangle_boxes(self) -> tuple[FloatArray, FloatArray]:
         return self.triangles.min(axis=1), self.triangles.max(axis=1)
+
+    @cached_property
+    def convex(self) -> bool:
+        """Whether it is a segment or point, or a mesh that encloses a convex volume; large meshes are not looked at."""
+        if len(self.faces) == 0:
+            return True
+        if not self.closed or len(self.faces) > _MOST_CONVEX_FACES:
+            return False
+        height = np.einsum(
+            "vfi,fi->vf", self.vertices[:, None] - self.triangles[None, :, 0], unit_normals(self.triangles)
+        )
+        return bool(height.max() <= touching_depth(self, self))
 
     @cached_property
     def component_faces(self) -> NDArray[np.int64]:

@@ -314,9 +314,8 @@ class Scene:
                 mend = f"raise {(packed.names + packed.cloth_names)[worst.a]!r} by that much (touching is fine)"
             else:
                 mend = "move them apart until they touch at most"
-            raise ValueError(
-                f"{first} and {second} interpenetrate at the start, by {worst.depth:.6g} m{others}; {mend}"
-            )
+            depth = f"{worst.depth:.6g}" if worst.exact else f"about {worst.depth:.2g}"
+            raise ValueError(f"{first} and {second} interpenetrate at the start, by {depth} m{others}; {mend}")
         for name, sheet in zip(packed.cloth_names, solids[len(self._bodies) :], strict=True):
             crossing = find_self_crossing(sheet)
             if crossing is not None:

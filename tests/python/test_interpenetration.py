@@ -34,7 +34,7 @@ def packed_depth(scene: Scene, packed: PackedScene) -> float:
     try:
         scene.validate(packed)
     except ValueError as error:
-        return float(re.search(r"interpenetrate at the start, by (\S+) m", str(error)).group(1))
+        return float(re.search(r"interpenetrate at the start, by (?:about )?(\S+) m", str(error)).group(1))
     return 0.0
 
 
@@ -136,7 +136,7 @@ def test_overlap_of_rounding_passes(turned: bool) -> None:
 @pytest.mark.parametrize("turned", [False, True])
 def test_coinciding_bodies(turned: bool) -> None:
     world = random_quaternion(np.random.default_rng(4)) if turned else None
-    assert depth_found(pair(shapes.box(1.0), shapes.box(1.0), (0, 0, 0), world=world)) == pytest.approx(0.5)
+    assert depth_found(pair(shapes.box(1.0), shapes.box(1.0), (0, 0, 0), world=world)) == pytest.approx(1.0)
     for make in (shapes.l_shape, shapes.torus, shapes.u_channel):
         assert depth_found(pair(make(), make(), (0, 0, 0), world=world)) > 0.01
 
@@ -200,7 +200,7 @@ def boxes_of(shape: str) -> tuple[tuple, list[tuple[np.ndarray, np.ndarray]]]:
 
 @pytest.mark.parametrize(("shape_a", "shape_b"), [("box", "box"), ("angle", "channel"), ("channel", "box")])
 def test_random_pairs_agree_with_separating_axes(shape_a: str, shape_b: str) -> None:
-    """Non-convex shapes as unions of boxes: overlap is decided, and for boxes the depth bounded, by a closed form."""
+    """Non-convex shapes as unions of boxes: overlap is decided, and for boxes the depth known, by a closed form."""
     rng = np.random.default_rng(5)
     (mesh_a, boxes_a), (mesh_b, boxes_b) = boxes_of(shape_a), boxes_of(shape_b)
     hits = misses = 0
@@ -216,8 +216,7 @@ def test_random_pairs_agree_with_separating_axes(shape_a: str, shape_b: str) -> 
             hits += 1
             assert found > 0.0
             if shape_a == shape_b == "box":
-                assert found <= truth * (1.0 + 1e-5)  # no point is deeper than the way out
-                assert found > 0.02 * truth
+                assert found == pytest.approx(truth, rel=1e-5)
         elif truth < -1e-6:
             misses += 1
             assert found == 0.0
@@ -298,7 +297,19 @@ def test_capsule_and_box() -> None:
     scene = Scene()
     scene.add_body(shapes.box(1.0), density=1.0)
     scene.add_capsule(0.1, 3.0, mass=1.0)  # right through the box, both ends outside
-    assert depth_found(scene) >= 0.1
+    assert depth_found(scene) == pytest.approx(0.6)
+
+
+def test_depth_is_the_shortest_way_out_of_convex_bodies_and_about_it_else() -> None:
+    cube, ball = shapes.box(1.0), shapes.icosphere(0.5, 2)
+    assert depth_found(pair(cube, cube, (0.9, 0.35, 0.4))) == pytest.approx(0.1)
+    assert depth_found(pair(cube, cube, (0.9, 0.0, 0.0))) == pytest.approx(0.1)
+    assert depth_found(pair(cube, shapes.box(0.1), (0.0, 0.0, 0.2))) == pytest.approx(0.35)
+    reach = float(ball[0][:, 0].max())
+    assert depth_found(pair(cube, ball, (0.5 + reach - 0.1, 0.2, 0.1))) == pytest.approx(0.1, rel=1e-3)
+    for other, words in ((cube, r"by 0\.1 m;"), (shapes.torus(0.5, 0.1), r"by about 0\.\d{1,3} m;")):
+        with pytest.raises(ValueError, match=words):
+            check(pair(other, cube, (0.9, 0.0, 0.0)))
 
 
 def test_given_margins_are_part_of_the_body() -> None:
