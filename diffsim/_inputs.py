@@ -177,6 +177,12 @@ def _arranged(
             )
         return t, True, batch
     elif t.ndim == 4 and got[2:] == shape and got[0] in (1, steps) and (batch is None or got[1] in (1, batch)):
+        if got[0] == got[1] != 1:
+            raise ValueError(
+                f"{where}: {name} of shape {got} is ambiguous, because there are as many steps as scenes in the batch;"
+                " write list(controls), one Control per step, if its first axis is time, and exchange the two axes"
+                f" before that, {name}.transpose(0, 1), if it is the batch"
+            )
         batch = got[1] if batch is None else batch
         return t.expand(steps, batch, count, width), True, batch
     size = "B" if batch is None else batch

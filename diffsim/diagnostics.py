@@ -175,9 +175,10 @@ def gradcheck(
         start = state.to(torch.float64).replace(**moved)
         given = {field: values[name] for field, name in _CONTROL_NAMES.items() if name in values}
         parameters = {f"sim.{name}": values[name] for name in (*PARAMETERS, *CLOTH_PARAMETERS) if name in values}
-        final, signature = torch.func.functional_call(
-            module, parameters, (start, Control(**given) if given else None, steps)
-        )
+        driven: Controls = Control(**given) if given else None
+        if driven is not None and isinstance(controls, Sequence):
+            driven = list(driven)  # one per step: with as many scenes as steps its first axis could be either
+        final, signature = torch.func.functional_call(module, parameters, (start, driven, steps))
         return loss(final), signature
 
     leaves = {name: t.detach().clone().requires_grad_(name in names) for name, t in inputs.items()}

@@ -266,8 +266,9 @@ class Simulator(SceneIdentity, Measurements):
             controls: None; one Control, held constant; a sequence with one Control per step; or a Control with a
                 leading time axis. A tensor of shape (n, 3) is constant; one of shape (steps, B, n, 3) has a time axis,
                 and either of its leading axes may have size 1. With an unbatched state, (steps, n, 3) has a time axis.
-                With a state of batch size B, (B, n, 3) is constant and (steps, n, 3) the same for all scenes; if B
-                equals steps these cannot be told apart, and the error says how to write either.
+                With a state of batch size B, (B, n, 3) is constant and (steps, n, 3) the same for all scenes. If B
+                equals steps, axes of that size cannot be told apart, and the error says how to write what is meant; a
+                sequence always works: ``list(controls)``, where the first axis is time.
             steps: Number of steps.
             checkpoint_every: Keep the record gradients need only for this many steps at a time, k, and compute it again
                 in the backward: memory O(steps / k + k), about one more forward in time, the same values bit by bit.

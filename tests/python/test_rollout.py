@@ -89,6 +89,14 @@ def test_time_or_batch_is_never_guessed(sim: ds.Simulator) -> None:
     assert_same(in_time, stepped(sim, state, [ds.Control(force=f) for f in force]))
     in_batch = sim.rollout(state, ds.Control(force=force[None]), 3)
     assert_same(in_batch, stepped(sim, state, [ds.Control(force=force)] * 3))
+    both = torch.randn(3, 3, 2, 3, dtype=torch.float64)
+    for start in (state, sim.initial_state()):  # the batch may come with the controls
+        with pytest.raises(ValueError, match=r"controls.force of shape \(3, 3, 2, 3\) is ambiguous.*list\(controls\)"):
+            sim.rollout(start, ds.Control(force=both), 3)
+        rolled = sim.rollout(start, list(ds.Control(force=both)), 3)
+        assert_same(rolled, stepped(sim, state, [ds.Control(force=f) for f in both]))
+    sequence = [ds.Control(force=f) for f in both]
+    assert ds.diagnostics.gradcheck(sim, state, sequence, steps=3, wrt=["force"], directions=1).passed
 
 
 def test_wrong_rollouts_are_named(sim: ds.Simulator, state: ds.State) -> None:
