@@ -8,6 +8,9 @@
 namespace diffsim {
 namespace {
 
+/// Directions carry rounding of 1e-16: edges whose squared sine is no more than this are exactly parallel.
+constexpr double kRoundedSineSq = 1e-30;
+
 /// Positions of a patch's corners; on the stack for all but unusual patches.
 class Corners {
 public:
@@ -87,7 +90,8 @@ ContactGeometry::ContactGeometry(const Contact& contact, const Surface& a, const
     normal = distance > 0.0 ? Vec3((1.0 / distance) * offset) : Vec3(Vec3::Zero());
     if (contact.type == ContactType::edge_edge) {
         const Vec3 &da = closest.edge_a, &db = closest.edge_b;
-        sine_sq = da.cross(db).squaredNorm() / (da.squaredNorm() * db.squaredNorm());
+        const double value = da.cross(db).squaredNorm() / (da.squaredNorm() * db.squaredNorm());
+        sine_sq = value > kRoundedSineSq ? value : 0.0;
     }
 }
 

@@ -45,7 +45,7 @@ struct ContactGeometry {
     ClosestPoints closest;  ///< in world axes
     double distance;        ///< between the bare meshes, margins not taken off [m]
     Vec3 normal;            ///< unit, from b to a
-    double sine_sq = 1.0;   ///< of the angle between two edges; 1 for other pairs
+    double sine_sq = 1.0;   ///< of the angle between two edges, 0 if they are parallel to rounding; 1 for other pairs
 };
 
 /// The geometry of a contact of two rigid bodies at these poses.

@@ -177,7 +177,8 @@ void add_distance_hessian(
     } else if (count_a == 1) {  // one of each edge; those of a patch are orthonormal
         const double g = S[0].dot(S[1]);
         G << 1.0, -g, -g, 1.0;
-        G /= S[0].cross(S[1]).squaredNorm();
+        // The sine that the mollifier goes by: the cross product of unit vectors may round to zero where it does not.
+        G /= geometry.sine_sq;
     }
     for (int k = 0; k < count; ++k) {
         const Vector<kSize> PG = -factor * (G(0, k) * P[0] + G(1, k) * P[1]);

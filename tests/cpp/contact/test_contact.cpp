@@ -229,6 +229,30 @@ TEST(exactly_parallel_edges_have_no_energy) {
     CHECK(s.energy() == 0.0);
 }
 
+TEST(derivatives_of_edges_that_are_parallel_up_to_rounding_are_finite) {
+    // The sine of such edges is rounding, and another one for the edges as they are and for their directions.
+    const Model model = two_bodies();
+    check::Random random(7);
+    int exactly = 0, nearly = 0;
+    for (int k = 0; k < 4000; ++k) {
+        NOTE(k);
+        const Mat3 R = k < 1000 ? random_rotation(random) : Mat3(Mat3::Identity());
+        const Vec3 gap = Vec3(0.1, 0.2, 0.9);
+        Situation s{model, {0, 0, ContactType::edge_edge, 0, 0}, {R, Vec3::Zero()}, {R, R * gap}};
+        s.contact.feature_a = s.contact.feature_b = static_cast<int>(random.uniform(0.0, 12.0));
+        const double angle = std::pow(10.0, -random.uniform(10.0, k % 4 == 1 ? 18.0 : 320.0));
+        if (k % 2 == 1) s.a.R = s.a.R + skew(angle * fixtures::random_direction(random)) * s.a.R;
+        s.range = {3.0, 3.0, 0.0, 0.0, 0.0};
+        const ContactDerivatives<12> d = s.derivatives();
+        CHECK(d.hessian.allFinite());
+        CHECK(d.hessian.norm() < 1e4 * kStiffness / kParallelLimit);
+        CHECK_NEAR(d.gradient, VectorX::Zero(12), 1e-3 * kStiffness);
+        (s.geometry().sine_sq == 0.0 ? exactly : nearly) += 1;
+    }
+    CHECK(exactly >= 500);
+    CHECK(nearly >= 50);
+}
+
 TEST(ground_derivatives_agree_with_differences) {
     const Model model = two_bodies();
     check::Random random(5);
