@@ -43,6 +43,7 @@ ClosestPoints swapped(const ClosestPoints& points) {
     ClosestPoints result = points;
     std::swap(result.point_a, result.point_b);
     std::swap(result.slide_count_a, result.slide_count_b);
+    std::swap(result.border_count_a, result.border_count_b);
     std::swap(result.edge_a, result.edge_b);
     return result;
 }

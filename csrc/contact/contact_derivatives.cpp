@@ -1,6 +1,7 @@
 #include "contact/contact_derivatives.hpp"
 
 #include <Eigen/Geometry>
+#include <algorithm>
 #include <cmath>
 #include <type_traits>
 #include <utility>
@@ -116,36 +117,33 @@ Vector<A::kSize + B::kSize> relative_row(const A& a, const B& b, const Vec3& dir
     return row;
 }
 
-/// Orthonormal directions along which the closest point of an object slides, as many as its count says.
+/// Orthonormal directions along which the closest point of an object slides, as many as its count says. On the border of
+/// a face the first runs along it.
 std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a) {
     const ClosestPoints& points = geometry.closest;
     const int count = of_a ? points.slide_count_a : points.slide_count_b;
     if (count == 0) return {Vec3::Zero(), Vec3::Zero()};
-    if (count == 1) return {(of_a ? points.edge_a : points.edge_b).normalized(), Vec3::Zero()};
-    const Vec3 first = geometry.normal.unitOrthogonal();
+    const Vec3& edge = of_a ? points.edge_a : points.edge_b;
+    if (count == 1) return {edge.normalized(), Vec3::Zero()};
+    const bool on_border = (of_a ? points.border_count_a : points.border_count_b) == 1;
+    const Vec3 first = on_border ? Vec3(edge.normalized()) : geometry.normal.unitOrthogonal();
     return {first, geometry.normal.cross(first)};
 }
 
-/// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|. With W = dw/dy,
-/// S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is orthogonal to S and n:
+/// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|, of which a closest
+/// point has as many as its count. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is
+/// orthogonal to S and n:
 ///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy²  =  WᵀNW/d - X - Xᵀ + n · d²w/dy²,  X = (SᵀW + ½ d q)ᵀ G q.
-/// A slide of one object changes its direction with the coordinates of that object alone.
+/// A slide of one object changes its direction with the coordinates of that object alone. All but n · d²w/dy² is added.
 template <class A, class B>
-void add_distance_hessian(
-    const ContactGeometry& geometry, const A& a, const B& b, double factor,
+void add_slide_hessian(
+    const ContactGeometry& geometry, const A& a, const B& b, int count_a, int count_b, double factor,
     HalfSymmetric<A::kSize + B::kSize>& hessian) {
     constexpr int kSize = A::kSize + B::kSize;
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
-    const ClosestPoints& points = geometry.closest;
-    // Nodes move on straight lines: only points on bodies have a curvature of their own.
-    if constexpr (!std::is_same_v<A, ClothMotion>)
-        hessian.template block<3, 3>(0, 0) += (0.5 * factor) * a.point_curvature(n);
-    if constexpr (!std::is_same_v<B, ClothMotion>)
-        hessian.template block<3, 3>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(n);
-
     const auto add_tangent = [&](const Vec3& tangent) { hessian.add_square(factor / d, relative_row(a, b, tangent)); };
-    const int count_a = points.slide_count_a, count = count_a + points.slide_count_b;
+    const int count = count_a + count_b;
     if (count == 0) {
         const Vec3 tangent = n.unitOrthogonal();
         add_tangent(tangent);
@@ -186,6 +184,29 @@ void add_distance_hessian(
             hessian.template add_outer<0, A::kTurnSize>(PG, q_a[k]);
         else
             hessian.template add_outer<A::kSize, B::kTurnSize>(PG, q_b[k]);
+    }
+}
+
+/// The same, whole. On the border of its feature a point slides one way alone, and the second derivative is another one on
+/// either side: their mean is taken. Where two equal edges lie side by side, an end of one leaves the other as an end of
+/// that one comes onto it: the sum over the contacts is the same on both sides, and the sum of the means is it.
+template <class A, class B>
+void add_distance_hessian(
+    const ContactGeometry& geometry, const A& a, const B& b, double factor,
+    HalfSymmetric<A::kSize + B::kSize>& hessian) {
+    // Nodes move on straight lines: only points on bodies have a curvature of their own.
+    if constexpr (!std::is_same_v<A, ClothMotion>)
+        hessian.template block<3, 3>(0, 0) += (0.5 * factor) * a.point_curvature(geometry.normal);
+    if constexpr (!std::is_same_v<B, ClothMotion>)
+        hessian.template block<3, 3>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(geometry.normal);
+    const ClosestPoints& points = geometry.closest;
+    const int count_a = points.slide_count_a, border_a = points.border_count_a;
+    const int count_b = points.slide_count_b, border_b = points.border_count_b;
+    if (border_a + border_b == 0) {
+        add_slide_hessian(geometry, a, b, count_a, count_b, factor, hessian);
+    } else {
+        add_slide_hessian(geometry, a, b, count_a, count_b, 0.5 * factor, hessian);
+        add_slide_hessian(geometry, a, b, count_a - border_a, count_b - border_b, 0.5 * factor, hessian);
     }
 }
 
@@ -312,7 +333,9 @@ ContactForce<A::kSize + B::kSize> derivatives_along(
         hessian->add_square(result.stiffness, result.row);
         if (with_curvature && result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, *hessian);
     }
-    if (!mollified) return result;
+    // An edge that has collapsed has no angle.
+    const double shorter_sq = std::min(geometry.closest.edge_a.squaredNorm(), geometry.closest.edge_b.squaredNorm());
+    if (!mollified || shorter_sq == 0.0) return result;
     // Mollifier mu(c), c = 1 - g², times potential: along dg, mu' = -2 g mu'(c) and mu'' = 4 g² mu''(c) - 2 mu'(c).
     const Angle<A, B> angle(geometry, a, b);
     const double g = angle.cosine, first = -2.0 * g * mollifier.first;

@@ -44,17 +44,35 @@ private:
     std::vector<Eigen::Index> m_rows;
 };
 
-/// The contacts as rows of the paper's J, in the free coordinates, and their stiffness.
+/// The contacts as rows of the paper's J, in the free coordinates, and their stiffness. Parallel edges have none, and no
+/// row.
 struct Rows {
-    MatrixX J;          // m x n
-    VectorX stiffness;  // m [kg]
+    MatrixX J;                           // m x n
+    VectorX stiffness;                   // m [kg]
+    std::vector<Eigen::Index> contacts;  // m, which of the active ones
+
+    /// One value per active contact of one per row.
+    VectorX of_contacts(const VectorX& of_rows, std::size_t contact_count) const {
+        VectorX result = VectorX::Zero(static_cast<Eigen::Index>(contact_count));
+        for (std::size_t k = 0; k < contacts.size(); ++k) result[contacts[k]] = of_rows[static_cast<Eigen::Index>(k)];
+        return result;
+    }
 };
 
 Rows collect_rows(const Zone& zone, const ZonePoint& point, const FreeCoordinates& free) {
-    const Eigen::Index count = static_cast<Eigen::Index>(point.active.size());
-    Rows rows{MatrixX::Zero(count, free.size()), VectorX(count)};
+    Rows rows;
+    std::vector<ContactTerm> terms;
+    for (std::size_t k = 0; k < point.active.size(); ++k) {
+        const ContactTerm term = contact_term(zone, point, point.active[k], Curvature::none);
+        if (term.stiffness == 0.0) continue;
+        rows.contacts.push_back(static_cast<Eigen::Index>(k));
+        terms.push_back(term);
+    }
+    const Eigen::Index count = static_cast<Eigen::Index>(terms.size());
+    rows.J = MatrixX::Zero(count, free.size());
+    rows.stiffness.resize(count);
     for (Eigen::Index k = 0; k < count; ++k) {
-        const ContactTerm term = contact_term(zone, point, point.active[static_cast<std::size_t>(k)], Curvature::none);
+        const ContactTerm& term = terms[static_cast<std::size_t>(k)];
         rows.stiffness[k] = term.stiffness;
         term.for_each(
             [&](int body, int offset) {
@@ -209,13 +227,18 @@ LinearisedZone linearise(const Zone& zone, const ZonePoint& point) {
 
 struct LinearisedSolver::Parts {
     const Zone& zone;
+    std::size_t contact_count;
     FreeCoordinates free;
     Rows rows;
     MatrixX cloth;
     std::optional<InertiaFactor> factor;  // for qr
 
     Parts(const Zone& z, const ZonePoint& point)
-        : zone(z), free(z), rows(collect_rows(z, point, free)), cloth(cloth_matrix(z, point, free)) {}
+        : zone(z),
+          contact_count(point.active.size()),
+          free(z),
+          rows(collect_rows(z, point, free)),
+          cloth(cloth_matrix(z, point, free)) {}
 };
 
 LinearisedSolver::LinearisedSolver(const Zone& zone, const ZonePoint& point, AdjointMode mode)
@@ -226,8 +249,10 @@ LinearisedSolver::~LinearisedSolver() = default;
 
 KktSolution LinearisedSolver::solve(const Coordinates& upstream) const {
     const Parts& p = *m_parts;
-    return p.factor ? solve_qr(p.free, *p.factor, p.rows, upstream)
-                    : solve_dense(p.zone, p.free, p.cloth, p.rows, upstream);
+    KktSolution solution = p.factor ? solve_qr(p.free, *p.factor, p.rows, upstream)
+                                    : solve_dense(p.zone, p.free, p.cloth, p.rows, upstream);
+    solution.multipliers = p.rows.of_contacts(solution.multipliers, p.contact_count);
+    return solution;
 }
 
 }  // namespace diffsim

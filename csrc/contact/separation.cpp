@@ -73,7 +73,9 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
     std::vector<Mat3> inertia_body(count);
     for (std::size_t i = 0; i < count; ++i)
         inertia_body[i] = zone.bodies[i].start.R.transpose() * zone.bodies[i].inertia * zone.bodies[i].start.R;
-    const std::vector<double> mass_factor(count, 1.0);
+    // Moving apart is geometry: however different their masses, bodies share the way.
+    std::vector<double> mass_factor(count);
+    for (std::size_t i = 0; i < count; ++i) mass_factor[i] = 1.0 / zone.bodies[i].mass;
     Separation result;
     ZonePoint point;
     BlockSystem system, cloth;

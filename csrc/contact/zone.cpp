@@ -282,8 +282,7 @@ void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
         const ContactGeometry& geometry =
             point.active.emplace_back(static_cast<int>(k), contact.contact, a, b, zone.ground_height).geometry;
         point.distances[k] = geometry.distance;
-        // Exactly parallel edges carry no energy and have no closest points: vertex-patch pairs act there.
-        if (geometry.distance < contact.range.rest && geometry.sine_sq != 0.0)
+        if (geometry.distance < contact.range.rest)
             point.contact_energy += contact_energy(geometry, contact.range, contact.stiffness.value);
         else
             point.active.pop_back();

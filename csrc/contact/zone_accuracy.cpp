@@ -40,6 +40,7 @@ double energy_noise(
     double force_sum = 0.0;
     pushed.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
     for (const ActiveContact& active : point.active) {
+        if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
         const ZoneContact& contact = zone.contacts[active.index];
         const double pole = contact.range.rest - contact.range.pole;
         const double force =

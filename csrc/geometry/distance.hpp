@@ -13,7 +13,12 @@ struct ClosestPoints {
     Vec3 point_a, point_b;
     int slide_count_a = 0;  ///< 0 at a vertex, 1 on an edge, 2 inside a face
     int slide_count_b = 0;
-    Vec3 edge_a, edge_b;  ///< the edge from its first end to its second, where the count is 1, and of two edges always
+    /// How many of these directions the point can follow one way alone, because up to rounding it is on the border of its
+    /// feature: what would move it the other way leaves it there.
+    int border_count_a = 0, border_count_b = 0;
+    /// The edge from its first end to its second, where the count is 1 or the point is on the border of a face; of two
+    /// edges always.
+    Vec3 edge_a, edge_b;
     std::uint32_t feature_code = 0;  ///< tells the type and the sub-features apart, for signatures
 
     double distance() const { return (point_a - point_b).norm(); }

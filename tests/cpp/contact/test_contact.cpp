@@ -253,6 +253,66 @@ TEST(derivatives_of_edges_that_are_parallel_up_to_rounding_are_finite) {
     CHECK(nearly >= 50);
 }
 
+TEST(on_the_border_of_a_feature_second_derivatives_are_the_mean_of_both_sides) {
+    // Equal boxes, one exactly above the other or shifted along a side: corners above corners and edges, edges that
+    // cross at their ends. Central differences of the gradient take the mean, too, and are exact to the first order there.
+    constexpr double kSmallStep = 1e-6, kFirstOrder = 1e-4;
+    const Model model = two_bodies();
+    const CollisionMesh& mesh = model.bodies[0].mesh;
+    check::Random random(8);
+    int vertices = 0, edges = 0;
+    const auto check = [&](Situation s) {
+        const ContactGeometry g = s.geometry();
+        const ClosestPoints& closest = g.closest;
+        if (g.distance > 0.35 || g.sine_sq < kParallelLimit || closest.border_count_a + closest.border_count_b == 0)
+            return false;
+        NOTE(s.kind());
+        s.range = {1.0, 1.0, 0.0, 0.0, 0.0};
+        const auto gradient = [&](const VectorX& x) { return s.gradient(x); };
+        const MatrixX hessian = s.derivatives().hessian;
+        CHECK_NEAR(
+            hessian, fixtures::numeric_jacobian(gradient, VectorX::Zero(12), kSmallStep), kFirstOrder * hessian.norm());
+        return true;
+    };
+    for (int k = 0; k < 6; ++k) {
+        NOTE(k);
+        const Mat3 R = k == 0 ? Mat3(Mat3::Identity()) : random_rotation(random);
+        const Vec3 gap(k % 3 == 1 ? 0.3 : 0.0, k % 3 == 2 ? 0.3 : 0.0, 2.0 * 0.4 + 0.3);
+        Situation s{model, {0, 0, ContactType::edge_edge, 0, 0}, {R, R * gap}, {R, Vec3::Zero()}};
+        for (int a = 0; a < static_cast<int>(mesh.edges.size()); ++a)
+            for (int b = 0; b < static_cast<int>(mesh.edges.size()); ++b) {
+                s.contact = {0, 0, ContactType::edge_edge, a, b};
+                edges += check(s) ? 1 : 0;
+            }
+        for (int v = 0; v < static_cast<int>(mesh.vertices.size()); ++v)
+            for (int p = 0; p < static_cast<int>(mesh.patches.size()); ++p) {
+                s.contact = {0, 0, ContactType::vertex_patch, v, p};
+                vertices += check(s) ? 1 : 0;
+                s.contact = {0, 0, ContactType::patch_vertex, p, v};
+                vertices += check(s) ? 1 : 0;
+            }
+    }
+    CHECK(vertices >= 60);
+    CHECK(edges >= 60);
+}
+
+TEST(exactly_parallel_edges_resist_turning) {
+    // Their energy is the mollifier's c / kParallelLimit, quadratic in the angle between them.
+    const Model model = two_bodies();
+    Situation s{model, {0, 0, ContactType::edge_edge, 0, 0}, {}, {Mat3::Identity(), Vec3(0.1, 0.2, 1.2)}};
+    s.range = {3.0, 3.0, 0.0, 0.0, 0.0};
+    for (int edge = 0; edge < 12; ++edge) {
+        NOTE(edge);
+        s.contact.feature_a = s.contact.feature_b = edge;
+        CHECK(s.geometry().sine_sq == 0.0);
+        const ContactDerivatives<12> d = s.derivatives();
+        CHECK(d.gradient.isZero(1e-12 * kStiffness));
+        const auto gradient = [&](const VectorX& x) { return s.gradient(x); };
+        CHECK(d.hessian.norm() > kStiffness);
+        CHECK_NEAR(d.hessian, fixtures::numeric_jacobian(gradient, VectorX::Zero(12), 1e-6), 1e-4 * d.hessian.norm());
+    }
+}
+
 TEST(ground_derivatives_agree_with_differences) {
     const Model model = two_bodies();
     check::Random random(5);

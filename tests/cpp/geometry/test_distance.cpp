@@ -233,3 +233,35 @@ TEST(nearly_parallel_edges_keep_their_distance) {
     }
     CHECK(cases_hit >= 400);
 }
+
+TEST(points_on_the_border_of_a_feature_are_told_apart_from_rounding) {
+    const std::vector<Vec3> square = {{0, 0, 0}, {0.5, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};  // one vertex on a side
+    const auto counts = [](const ClosestPoints& found) { return std::pair(found.slide_count_b, found.border_count_b); };
+    check::Random random(6);
+    for (int k = 0; k < 50; ++k) {
+        NOTE(k);
+        const Mat3 R = random_rotation(random);
+        const Vec3 t = random_vec3(random, 3.0);
+        std::vector<Vec3> p;
+        for (const Vec3& x : square) p.push_back(R * x + t);
+        const auto found = [&](double x, double y, double z) { return closest(R * Vec3(x, y, z) + t, p); };
+        CHECK(counts(found(0.3, 0.4, 0.2)) == std::pair(2, 0));
+        CHECK(counts(found(0.3, 0.0, 0.2)) == std::pair(2, 1));
+        CHECK_NEAR(found(0.3, 0.0, 0.2).edge_b.normalized().cross(R.col(0)), Vec3::Zero(), kRounding);
+        CHECK(counts(found(0.5, 0.0, 0.2)) == std::pair(2, 1));  // a vertex there changes nothing
+        CHECK(counts(found(1.0, 0.0, 0.2)) == std::pair(2, 2));
+        CHECK(counts(found(0.3, -0.2, 0.2)) == std::pair(1, 0));
+        CHECK(counts(found(0.5, -0.2, 0.2)) == std::pair(1, 0));
+        CHECK(counts(found(1.0, -0.2, 0.2)) == std::pair(1, 1));
+        CHECK(counts(found(1.2, 0.0, 0.2)) == std::pair(1, 1));
+        CHECK(counts(found(1.2, -0.2, 0.2)) == std::pair(0, 0));
+        CHECK_NEAR(found(1.0, 0.0, 0.2).point_b, Vec3(R.col(0) + t), 1e-9);
+        const EdgePair crossed{
+            R * Vec3(0, 0, 1) + t, R * Vec3(1, 0, 1) + t, R * Vec3(1, -1, 0) + t, R * Vec3(1, 1, 0) + t};
+        const ClosestPoints of_edges = closest(crossed);
+        CHECK(of_edges.slide_count_a == 1);
+        CHECK(of_edges.border_count_a == 1);
+        CHECK(of_edges.slide_count_b == 1);
+        CHECK(of_edges.border_count_b == 0);
+    }
+}
