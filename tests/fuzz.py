@@ -2,16 +2,21 @@
 
     python tests/fuzz.py --scenes 200 --steps 300 --seed 0
     python tests/fuzz.py --scenes 40 --steps 100 --bodies 4 --cloths 1 --gradients 20
+    python tests/fuzz.py --regular --scenes 200 --steps 60 --gradients 20
 
 Each scene has ten bodies, convex and not, that fall on each other, every second time between four walls; with --cloths
-sheets of random material among them, some of them pinned. With --gradients k the gradient of every k-th step is held
-against central differences: it is wrong if it agrees with those of no step size. Scene k of seed S is the same whatever
-the number of scenes: `--first k --scenes 1` runs it alone.
+sheets of random material among them, some of them pinned. With --regular they are those of tests/python/regular_scenes
+instead: stacks, walls, rows, with edges parallel and corners above corners. With --gradients k the gradient of every
+k-th step is held against differences: it is wrong if it agrees with those of no step size. Scene k of seed S is the
+same whatever the number of scenes: `--first k --scenes 1` runs it alone. With --failures the state before each step
+that does not converge is written there.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import statistics
 import sys
 import time
 import warnings
@@ -25,12 +30,15 @@ import torch
 import diffsim as ds
 
 sys.path.insert(0, str(Path(__file__).parent / "python"))
+import differences
 from penetration import CrossingCheck, PenetrationCheck
+from regular_scenes import regular_scene
 
 DT = 0.01
 WALL = 0.1  # [m]
 DIFFERENCES = (1e-6, 1e-5, 3e-6, 3e-7, 1e-7, 3e-8, 1e-8)  # step sizes of central differences
 WRONG = 1e-4  # relative error of a derivative; differences have up to a hundredth of that of their own
+SLOW = 200.0  # of a scene's median step
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,7 @@ class Outcome:
     failed_steps: int
     contacts: int  # in the last step
     seconds: float
+    slowest: float  # step, relative to the median, in process time
     gradient: float  # largest entry
     derivatives: int  # held against differences
 
@@ -156,14 +165,22 @@ def disagreement(checks: list[ds.diagnostics.DirectionCheck]) -> str:
     return f"derivative by {best.name} is {best.derivative:g}, differences say {best.difference:g}"
 
 
-def run_scene(seed: int, index: int, bodies: int, cloths: int, steps: int, every: int) -> Outcome:
+def save(state: ds.State, directory: Path, name: str) -> None:
+    directory.mkdir(parents=True, exist_ok=True)
+    fields = {name: value.tolist() for name, value in vars(state.detach()).items() if value is not None}
+    (directory / f"{name}.json").write_text(json.dumps(fields))
+
+
+def run_scene(scene: ds.Scene, index: int, steps: int, every: int, failures: Path | None, regular: bool) -> Outcome:
     """`every`: steps from one that is held against differences to the next; 0 for none."""
-    scene = random_scene(seed, index, bodies, cloths)
     start = time.perf_counter()
     sim = ds.Simulator(scene, DT)
     generator = torch.Generator().manual_seed(index)
     state = sim.initial_state()
+    cloths = state.node_position.numel() > 0
     force = 0.5 * sim.mass[:, None] * torch.randn(*state.velocity.shape, generator=generator, dtype=torch.float64)
+    if regular:
+        force = torch.zeros_like(force)
     leaves = {
         "position": state.position,
         "orientation": state.orientation,
@@ -181,39 +198,54 @@ def run_scene(seed: int, index: int, bodies: int, cloths: int, steps: int, every
         leaves |= {name: getattr(sim, name) for name in ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend")}
     for leaf in leaves.values():
         leaf.requires_grad_()
-    try:
-        trajectory = sim.rollout(state, ds.Control(force=force), steps)
-    except ValueError as error:  # it refuses a state that it made itself
-        return Outcome([str(error)], 0, 0, time.perf_counter() - start, 0.0, 0)
+    control = ds.Control(force=force)
+    frames, times, failed, contacts = [state], [], 0, 0
+    for step in range(1, steps + 1):
+        begin = time.process_time()
+        try:
+            frames.append(sim(frames[-1], control))
+        except ValueError as error:  # it refuses a state that it made itself
+            return Outcome([f"step {step}: {error}"], failed, contacts, time.perf_counter() - start, 0.0, 0.0, 0)
+        times.append(time.process_time() - begin)
+        assert sim.info is not None
+        contacts = sim.info.contacts
+        if not sim.info.converged:
+            failed += 1
+            if failures is not None:
+                save(frames[-2], failures, f"scene_{index}_before_step_{step}")
+    end = frames[-1]
     loss = torch.zeros((), dtype=torch.float64)
     for name in fields:
-        value = getattr(trajectory, name)[-1]
+        value = getattr(end, name)
         loss = loss + (value * torch.randn(value.shape, generator=generator, dtype=torch.float64)).sum()
     gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values()))))
     seconds = time.perf_counter() - start
 
     problems = [f"gradient of {name} is not finite" for name, g in gradients.items() if not bool(g.isfinite().all())]
-    problems += [f"gradient of {name} is zero" for name, g in gradients.items() if not g.any()]
+    if not regular:  # where nothing turns, inertia has none
+        problems += [f"gradient of {name} is zero" for name, g in gradients.items() if not g.any()]
     for name in fields:
-        if not bool(getattr(trajectory, name).isfinite().all()):
+        if not bool(getattr(end, name).isfinite().all()):
             problems.append(f"{name} is not finite")
-    assert sim.info is not None
-    failed, contacts = sim.info.failed_steps, sim.info.contacts
+    slowest = max(times) / statistics.median(times)
     largest = max(float(g.abs().max()) for g in gradients.values())
 
-    checks = [PenetrationCheck(scene, sim.thickness)] + [CrossingCheck(scene, sim.thickness)] * bool(cloths)
+    checks: list[Any] = [PenetrationCheck(scene, sim.thickness)]
+    if cloths:
+        checks.append(CrossingCheck(scene, sim.thickness))
     derivatives = 0
-    for step, frame in enumerate(trajectory.detach(), 1):
+    hold = differences.wrong_derivatives if regular else wrong_derivatives
+    for step, frame in enumerate((frame.detach() for frame in frames[1:]), 1):
         found = [text for check in checks for text in check.problems(sim, frame)]
         if every and step % every == 0:
             with torch.no_grad():
                 sim(frame, ds.Control(force=force))
             if sim.info.converged:  # else the step ended short of what is differentiated
-                count, wrong = wrong_derivatives(sim, frame, ds.Control(force=force), step)
+                count, wrong = hold(sim, frame, ds.Control(force=force.detach()), step)
                 derivatives += count
                 found += wrong
         problems += [f"after step {step}: {text}" for text in found]
-    return Outcome(problems, failed, contacts, seconds, largest, derivatives)
+    return Outcome(problems, failed, contacts, seconds, slowest, largest, derivatives)
 
 
 def main() -> int:
@@ -225,28 +257,35 @@ def main() -> int:
     parser.add_argument("--gradients", type=int, default=0, help="every so many steps")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="index of the first scene")
+    parser.add_argument("--regular", action="store_true", help="scenes in which everything is aligned")
+    parser.add_argument("--failures", type=Path, help="directory for the states before steps that do not converge")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", ds.ConvergenceWarning)  # they are counted instead
-    bad, failed, unconverged_scenes, derivatives, begin = 0, 0, 0, 0, time.perf_counter()
+    bad, failed, unconverged_scenes, slow, derivatives, begin = 0, 0, 0, 0, 0, time.perf_counter()
     for index in range(arguments.first, arguments.first + arguments.scenes):
-        outcome = run_scene(
-            arguments.seed, index, arguments.bodies, arguments.cloths, arguments.steps, arguments.gradients
-        )
+        if arguments.regular:
+            scene = regular_scene(arguments.seed, index)
+        else:
+            scene = random_scene(arguments.seed, index, arguments.bodies, arguments.cloths)
+        outcome = run_scene(scene, index, arguments.steps, arguments.gradients, arguments.failures, arguments.regular)
         derivatives += outcome.derivatives
         bad += bool(outcome.problems)
         failed += outcome.failed_steps
         unconverged_scenes += outcome.failed_steps > 0
+        slow += outcome.slowest > SLOW
         print(
             f"scene {index}: {outcome.seconds:.2f} s, {outcome.contacts} contacts at the end, largest gradient"
-            f" {outcome.gradient:.1e}, {outcome.failed_steps} steps did not converge, {len(outcome.problems)} problems",
+            f" {outcome.gradient:.1e}, slowest step {outcome.slowest:.0f} medians{' (!)' * (outcome.slowest > SLOW)},"
+            f" {outcome.failed_steps} steps did not converge, {len(outcome.problems)} problems",
             flush=True,
         )
         for text in outcome.problems[:5]:
             print(f"  {text}", flush=True)
     print(
-        f"{arguments.scenes} scenes of {arguments.bodies} bodies and {arguments.steps} steps in"
-        f" {time.perf_counter() - begin:.0f} s: {bad} scenes with problems; {failed} of"
+        f"{arguments.scenes} scenes of {'regular' if arguments.regular else arguments.bodies} bodies and"
+        f" {arguments.steps} steps in {time.perf_counter() - begin:.0f} s: {bad} scenes with problems; {failed} of"
         f" {arguments.scenes * arguments.steps} steps in {unconverged_scenes} scenes did not converge;"
+        f" a step took more than {SLOW:.0f} medians in {slow} scenes;"
         f" {derivatives} derivatives held against differences"
     )
     return 1 if bad else 0
