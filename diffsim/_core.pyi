@@ -158,18 +158,18 @@ def separate(
 def min_distance(
     model: Model, position: NDArray[np.float64], orientation: NDArray[np.float64], node_position: NDArray[np.float64]
 ) -> tuple[float, int, int]: ...
-def vertex_polygon_toi(
+def vertex_polygon_ccd(
     vertex: NDArray[np.float64],
     polygon0: NDArray[np.float64],
     polygon1: NDArray[np.float64],
     min_distance: float,
     tolerance: float,
-) -> float: ...
-def edge_edge_toi(
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]: ...
+def edge_edge_ccd(
     a0: NDArray[np.float64],
     a1: NDArray[np.float64],
     b0: NDArray[np.float64],
     b1: NDArray[np.float64],
     min_distance: float,
     tolerance: float,
-) -> float: ...
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]: ...

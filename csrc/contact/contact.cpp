@@ -114,15 +114,16 @@ double contact_toi(
     if (contact.type == ContactType::edge_edge) {
         const Ends a0(a.begin, contact.feature_a), a1(a.end, contact.feature_a);
         const Ends b0(b.begin, contact.feature_b), b1(b.end, contact.feature_b);
-        return edge_edge_toi(a0.x, a1.x, b0.x, b1.x, options);
+        return edge_edge_ccd(a0.x, a1.x, b0.x, b1.x, options).toi;
     }
     const bool vertex_on_a = contact.type == ContactType::vertex_patch;
     const SweptSurface &v = vertex_on_a ? a : b, &p = vertex_on_a ? b : a;
     const int vertex = vertex_on_a ? contact.feature_a : contact.feature_b;
     const int patch = vertex_on_a ? contact.feature_b : contact.feature_a;
     const Corners begin(p.begin, patch), end(p.end, patch);
-    return vertex_polygon_toi(
-        v.begin.vertex(vertex), v.end.vertex(vertex), begin.data(), end.data(), begin.count(), options);
+    return vertex_polygon_ccd(
+               v.begin.vertex(vertex), v.end.vertex(vertex), begin.data(), end.data(), begin.count(), options)
+        .toi;
 }
 
 std::array<int, 3> feature_vertices(const CollisionMesh& mesh, const Contact& contact, bool of_a) {

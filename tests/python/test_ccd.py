@@ -20,6 +20,7 @@ TOLERANCE = 1e-6  # of impacts, as an absolute distance at positions of size one
 # Distances of points of size one that move by one are exact to a few ulps of that, here 4.
 ROUNDING = 1e-15
 SAMPLES = np.linspace(0.0, 1.0, 6)
+MOST_ITERATIONS = 60
 
 
 @dataclass(frozen=True)
@@ -96,14 +97,18 @@ def make_pair(rng: np.random.Generator, category: str, weights: Callable[..., Fl
 
 
 def vertex_triangle_toi(pair: Pair, min_distance: float, tolerance: float) -> float:
-    vertex = np.ascontiguousarray([pair.start[0], pair.end[0]])
-    start, end = np.ascontiguousarray(pair.start[1:]), np.ascontiguousarray(pair.end[1:])
-    return float(_core.vertex_polygon_toi(vertex, start, end, min_distance, tolerance))
+    vertex = np.ascontiguousarray([[pair.start[0], pair.end[0]]])
+    start, end = np.ascontiguousarray(pair.start[None, 1:]), np.ascontiguousarray(pair.end[None, 1:])
+    toi, iterations = _core.vertex_polygon_ccd(vertex, start, end, min_distance, tolerance)
+    assert iterations[0] <= MOST_ITERATIONS
+    return float(toi[0])
 
 
 def edge_edge_toi(pair: Pair, min_distance: float, tolerance: float) -> float:
-    a0, b0, a1, b1 = (np.ascontiguousarray(x) for x in (pair.start[:2], pair.start[2:], pair.end[:2], pair.end[2:]))
-    return float(_core.edge_edge_toi(a0, a1, b0, b1, min_distance, tolerance))
+    ends = (pair.start[:2], pair.end[:2], pair.start[2:], pair.end[2:])
+    toi, iterations = _core.edge_edge_ccd(*(np.ascontiguousarray(x[None]) for x in ends), min_distance, tolerance)
+    assert iterations[0] <= MOST_ITERATIONS
+    return float(toi[0])
 
 
 def distance(kind: str, pair: Pair, time: float) -> float:
@@ -201,15 +206,16 @@ def test_does_not_depend_on_names_or_place(kind: str) -> None:
 
 def test_closed_forms_of_impacts() -> None:
     """A vertex falls on a square, and one edge on another: both bounds."""
-    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    square = np.array([[[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]])
     for height, speed in ((0.5, 1.0), (0.1, 3.0), (2.0, 2.5), (1e-3, 1e3)):
         exact = height / speed
-        falling = np.array([[0.2, -0.3, height], [0.2, -0.3, height - speed]])
-        toi = _core.vertex_polygon_toi(falling, square, square, 0.0, 1e-9)
+        falling = np.array([[[0.2, -0.3, height], [0.2, -0.3, height - speed]]])
+        (toi,), _ = _core.vertex_polygon_ccd(falling, square, square, 0.0, 1e-9)
         assert exact - 1e-9 / speed <= toi <= exact
-        a0 = np.array([[-1.0, 0.1, height], [1.0, 0.1, height]])
-        b = np.array([[0.3, -1.0, 0.0], [0.3, 1.0, 0.0]])
-        toi = _core.edge_edge_toi(a0, a0 - [0, 0, speed], b, b, 0.0, 1e-9)
+        a0 = np.array([[[-1.0, 0.1, height], [1.0, 0.1, height]]])
+        b = np.array([[[0.3, -1.0, 0.0], [0.3, 1.0, 0.0]]])
+        (toi,), _ = _core.edge_edge_ccd(a0, a0 - [0, 0, speed], b, b, 0.0, 1e-9)
         assert exact - 1e-9 / speed <= toi <= exact
-    beside = np.array([[1.5, 0.0, 1.0], [1.5, 0.0, -1.0]])
-    assert _core.vertex_polygon_toi(beside, square, square, 0.0, 1e-9) == np.inf
+    beside = np.array([[[1.5, 0.0, 1.0], [1.5, 0.0, -1.0]]])
+    (toi,), _ = _core.vertex_polygon_ccd(beside, square, square, 0.0, 1e-9)
+    assert toi == np.inf

@@ -2,10 +2,10 @@
 
 #include <algorithm>
 
-#include "fixtures.hpp"
-#include "geometry/distance.hpp"
+#include "ccd_fixtures.hpp"
 
 using namespace diffsim;
+using fixtures::Motion;
 using fixtures::random_polygon;
 using fixtures::random_rotation;
 using fixtures::random_vec3;
@@ -15,29 +15,7 @@ namespace {
 constexpr double kTolerance = 1e-7;  // [m], given to the CCD: it stops within this above the distance to keep
 constexpr double kRounding = 1e-13;  // [m], of coordinates of order 1
 
-/// A vertex and a polygon, or two edges, as points at the start and the end of the motion.
-struct Motion {
-    std::vector<Vec3> begin, end;
-    bool is_edges;
-
-    std::vector<Vec3> at(double s) const {
-        std::vector<Vec3> points;
-        for (std::size_t k = 0; k < begin.size(); ++k) points.push_back(begin[k] + s * (end[k] - begin[k]));
-        return points;
-    }
-    double distance(double s) const {
-        const std::vector<Vec3> x = at(s);
-        if (is_edges) return closest_edge_edge(x[0], x[1], x[2], x[3]).distance();
-        const int count = static_cast<int>(x.size()) - 1;
-        return closest_vertex_polygon(x[0], {&x[1], count, polygon_normal(&x[1], count)}).distance();
-    }
-    double toi(const CcdOptions& options) const {
-        if (is_edges) return edge_edge_toi(&begin[0], &end[0], &begin[2], &end[2], options);
-        return vertex_polygon_toi(begin[0], end[0], &begin[1], &end[1], static_cast<int>(begin.size()) - 1, options);
-    }
-};
-
-CcdOptions keeping(double min_distance) { return {min_distance, kTolerance, 1000}; }
+CcdOptions keeping(double min_distance) { return {min_distance, kTolerance}; }
 
 /// The same motion seen from elsewhere, from a moving frame, and with its parts named in another order.
 std::vector<Motion> variants(const Motion& motion, check::Random& random) {

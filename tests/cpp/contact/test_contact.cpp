@@ -366,7 +366,7 @@ TEST(ground_derivatives_agree_with_differences) {
 TEST(contact_toi_stops_every_type_at_its_floor) {
     const Model model = two_bodies();
     check::Random random(6);
-    const CcdOptions options{0.05, 1e-6, 1000};
+    const CcdOptions options{0.05, 1e-6};
     int cases_hit[3] = {0, 0, 0};
     for (int k = 0; k < 300; ++k) {
         NOTE(k);

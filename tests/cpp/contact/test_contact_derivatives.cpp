@@ -268,7 +268,7 @@ TEST(curvature_of_contacts_with_cloth_can_be_left_out) {
 
 TEST(contact_toi_with_cloth_stops_every_type_at_its_floor) {
     check::Random random(5);
-    const CcdOptions options{0.05, 1e-6, 1000};
+    const CcdOptions options{0.05, 1e-6};
     int cases_hit[6] = {0, 0, 0, 0, 0, 0};
     for (int k = 0; k < 300; ++k) {
         NOTE(k);
