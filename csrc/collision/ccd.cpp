@@ -46,8 +46,9 @@ struct Features {
     double extent;  ///< bound on the coordinates of all vertices, relative to the first
 };
 
-/// How long the plane with the fixed normal n keeps the features this far apart, from `time` on; exact.
-double fixed_reach(const Features& features, const Vec3& n, double time, double keep) {
+/// How long from `time` on the plane with the fixed normal n keeps the features this far apart, or infinity if until the
+/// time `until` at least; exact.
+double fixed_reach(const Features& features, const Vec3& n, double time, double until, double keep) {
     double reach = kInfinity;
     for (int i = 0; i < features.count_a; ++i) {
         const double velocity_a = n.dot(features.a[i].velocity);
@@ -56,7 +57,8 @@ double fixed_reach(const Features& features, const Vec3& n, double time, double 
             const double velocity_b = n.dot(features.b[j].velocity);
             const double room = room_a - (n.dot(features.b[j].start) + time * velocity_b);
             if (!(room > 0.0)) return 0.0;
-            if (velocity_b > velocity_a) reach = std::min(reach, room / (velocity_b - velocity_a));
+            const double speed = velocity_b - velocity_a;
+            if (speed * (until - time) > room) reach = std::min(reach, room / speed);
         }
     }
     return reach;
@@ -176,7 +178,7 @@ Vec3 middle_offset(const Features& features) {
     Vec3 a = Vec3::Zero(), b = Vec3::Zero();
     for (int i = 0; i < features.count_a; ++i) a += features.a[i].start;
     for (int j = 0; j < features.count_b; ++j) b += features.b[j].start;
-    return a / features.count_a - b / features.count_b;
+    return (1.0 / features.count_a) * a - (1.0 / features.count_b) * b;
 }
 
 /// The common loop. The times it visits do not depend on `until`, so that one impact has one time, whoever asks.
@@ -189,14 +191,15 @@ CcdResult advance(const Pair& pair, const CcdOptions& options) {
     // Between small features far from each other any plane does: most pairs that meshes list need no closest points.
     const Vec3 middles = middle_offset(pair.features);
     const double apart = middles.norm();
-    if (apart > near && fixed_reach(pair.features, middles / apart, 0.0, keep) >= options.until) return {kNoImpact, 0};
+    if (apart > near && fixed_reach(pair.features, (1.0 / apart) * middles, 0.0, options.until, keep) == kInfinity)
+        return {kNoImpact, 0};
     double time = 0.0, span = 1.0;
     for (int k = 0; k < options.max_iterations; ++k) {
         const ClosestPoints points = pair.closest(time);
         const Vec3 offset = points.point_a - points.point_b;
         const double distance = offset.norm();
         if (!(distance > near)) return {time, k};
-        double next = time + fixed_reach(pair.features, offset / distance, time, keep);
+        double next = time + fixed_reach(pair.features, (1.0 / distance) * offset, time, options.until, keep);
         // Where features nearly touch, their offset is mostly rounding: the plane across it may not separate them.
         if (next < options.until && (k >= kFixedAdvances || !(next > time))) {
             const double end = std::min(time + span, 1.0);
@@ -219,9 +222,8 @@ Line relative_line(const Vec3& begin, const Vec3& end, const Vec3& origin_begin,
     return {start, (end - origin_end) - start};
 }
 
-double extent(const Line& line) {
-    return std::max(line.start.cwiseAbs().maxCoeff(), (line.start + line.velocity).cwiseAbs().maxCoeff());
-}
+/// Bound on the line's coordinates on the way.
+Vec3 extent(const Line& line) { return line.start.cwiseAbs() + line.velocity.cwiseAbs(); }
 
 }  // namespace
 
@@ -240,13 +242,13 @@ CcdResult vertex_polygon_ccd(
         large_points.resize(static_cast<std::size_t>(count));
     }
     Line* lines = is_large ? large_lines.data() : small.lines.data();
-    double size = 0.0;
+    Vec3 size = Vec3::Zero();
     for (int k = 0; k < count; ++k) {
         lines[k] = relative_line(p0[k], p1[k], x0, x1);
-        size = std::max(size, extent(lines[k]));
+        size = size.cwiseMax(extent(lines[k]));
     }
     const Line vertex{Vec3::Zero(), Vec3::Zero()};
-    const Features features{&vertex, lines, 1, count, size};
+    const Features features{&vertex, lines, 1, count, size.maxCoeff()};
     return advance(VertexPolygon{features, is_large ? large_points.data() : small.points.data()}, options);
 }
 
@@ -254,7 +256,7 @@ CcdResult edge_edge_ccd(
     const Vec3 a0[2], const Vec3 a1[2], const Vec3 b0[2], const Vec3 b1[2], const CcdOptions& options) {
     const Line a[2] = {{Vec3::Zero(), Vec3::Zero()}, relative_line(a0[1], a1[1], a0[0], a1[0])};
     const Line b[2] = {relative_line(b0[0], b1[0], a0[0], a1[0]), relative_line(b0[1], b1[1], a0[0], a1[0])};
-    const double size = std::max({extent(a[1]), extent(b[0]), extent(b[1])});
+    const double size = extent(a[1]).cwiseMax(extent(b[0])).cwiseMax(extent(b[1])).maxCoeff();
     return advance(EdgeEdge{{a, b, 2, 2, size}}, options);
 }
 
