@@ -17,6 +17,7 @@ SCRIPTS = sorted(BENCHMARKS.glob("[a-z]*.py"))
 COLUMNS = {
     "adjoint_modes": ("scene", "qr_state", "exact_error_median", "dense_backward_ms"),
     "batch": ("case", "scenes", "loop_forward_per_s", "gradient_ratio"),
+    "ccd": ("case", "most_advances", "ours_us", "additive_us", "inclusion_to_ours", "inclusion_lost"),
     "cloth": ("side_nodes", "forward_contact_ms", "mujoco_step_ms", "backward_to_forward", "vbd_depth_m"),
     "cloth_accuracy": ("scene", "name", "time_ms_per_s", "step_error_mm", "error_mm", "depth_mm"),
     "contact_rich": ("scene", "forward_ms", "longest_ms", "failed_steps", "forward_to_mujoco", "longest_to_resting"),
@@ -32,7 +33,7 @@ COLUMNS = {
 POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times
 TEXT = ("mode", "step", "scene", "material", "name", "case", "directions", "peer", "what")
 
-for package in ("matplotlib", "mujoco"):
+for package in ("matplotlib", "mujoco", "ipctk"):
     pytest.importorskip(package, reason="the benchmarks' packages: pip install .[bench]")
 
 
