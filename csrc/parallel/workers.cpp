@@ -11,6 +11,9 @@ namespace {
 /// than waking it costs a few times over.
 constexpr std::chrono::microseconds kPatience{100};
 
+/// How often an owner that waits long looks up.
+constexpr std::chrono::milliseconds kGlance{20};
+
 struct Ranges {
     std::uint32_t first, end;
 
@@ -55,7 +58,7 @@ void Workers::share(int count, int grain, const void* work, Call call) {
     m_unclaimed = pack({0, static_cast<std::uint32_t>(range_count)});  // from here on the loop is everybody's
     wake();
     run_ranges(0);
-    wait_until([this] { return m_unfinished == 0; });
+    wait_until([this] { return m_unfinished == 0; }, m_while_waiting);
     if (m_error) std::rethrow_exception(std::exchange(m_error, nullptr));
 }
 
@@ -91,7 +94,7 @@ void Workers::run_ranges(int thread) {
 }
 
 template <class Ready>
-void Workers::wait_until(const Ready& ready) {
+void Workers::wait_until(const Ready& ready, const std::function<void()>& while_waiting) {
     using Clock = std::chrono::steady_clock;
     const Clock::time_point give_up = Clock::now() + kPatience;
     do {
@@ -100,7 +103,15 @@ void Workers::wait_until(const Ready& ready) {
     } while (Clock::now() < give_up);
     std::unique_lock<std::mutex> lock(m_mutex);
     ++m_sleeping;
-    m_changed.wait(lock, ready);
+    if (!while_waiting) {
+        m_changed.wait(lock, ready);
+    } else {
+        while (!m_changed.wait_for(lock, kGlance, ready)) {
+            lock.unlock();
+            while_waiting();
+            lock.lock();
+        }
+    }
     --m_sleeping;
 }
 

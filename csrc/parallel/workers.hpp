@@ -18,9 +18,12 @@ namespace diffsim {
 /// sleep, and a loop never waits for one to wake up: whoever is awake takes the next range.
 class Workers {
 public:
-    /// Each thread but the owner's calls `at_end` with its number before it ends.
-    explicit Workers(int thread_count, std::function<void(int thread)> at_end = nullptr)
-        : m_thread_count(thread_count), m_at_end(std::move(at_end)) {}
+    /// Each thread but the owner's calls `at_end` with its number before it ends. The owner calls `while_waiting`, which must
+    /// not throw, now and then while it waits for the others at the end of a loop.
+    explicit Workers(
+        int thread_count, std::function<void(int thread)> at_end = nullptr,
+        std::function<void()> while_waiting = nullptr)
+        : m_thread_count(thread_count), m_at_end(std::move(at_end)), m_while_waiting(std::move(while_waiting)) {}
     ~Workers();
     Workers(const Workers&) = delete;
     Workers& operator=(const Workers&) = delete;
@@ -53,11 +56,12 @@ private:
     int claim_range(int thread);
     bool any_unclaimed() const;
     template <class Ready>
-    void wait_until(const Ready& ready);
+    void wait_until(const Ready& ready, const std::function<void()>& while_waiting = nullptr);
     void wake();
 
     int m_thread_count;
     std::function<void(int thread)> m_at_end;
+    std::function<void()> m_while_waiting;
     std::vector<std::thread> m_threads;
 
     // The loop at hand. Read by those alone who have claimed one of its ranges and not yet finished it.

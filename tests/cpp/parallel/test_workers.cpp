@@ -1,3 +1,4 @@
+#include "parallel/interrupt.hpp"
 #include "parallel/workers.hpp"
 
 #include <chrono>
@@ -106,6 +107,44 @@ TEST(workers_throw_what_the_first_range_threw) {
         workers.for_each_range(1, 1, [&](int, int, int) { ++calls; });
         CHECK(calls == 1);
     }
+}
+
+TEST(workers_let_a_waiting_owner_look_up) {
+    std::atomic<int> looks{0};
+    Workers workers(2, nullptr, [&] { ++looks; });
+    std::atomic<int> arrived{0};
+    // The other thread's range ends only when the owner, which is done with its own, has looked up.
+    workers.for_each_range(2, 1, [&](int, int, int thread) {
+        ++arrived;
+        while (arrived < 2) std::this_thread::yield();
+        if (thread != 0)
+            while (looks < 2) std::this_thread::yield();
+    });
+    CHECK(looks >= 2);
+}
+
+TEST(interrupt_is_polled_by_its_maker_alone_and_seen_by_all) {
+    std::atomic<int> polls{0};
+    std::atomic<bool> wanted{false};
+    const std::thread::id maker = std::this_thread::get_id();
+    bool by_maker = true;
+    Interrupt interrupt([&] {
+        ++polls;
+        by_maker = by_maker && std::this_thread::get_id() == maker;
+        return wanted.load();
+    });
+    std::atomic<bool> seen{false};
+    std::thread other([&] {
+        while (!interrupt.asked()) std::this_thread::yield();
+        seen = true;
+    });
+    while (polls < 2) CHECK(!interrupt.asked());
+    wanted = true;
+    while (!interrupt.asked()) std::this_thread::yield();
+    other.join();
+    CHECK(seen);
+    CHECK(by_maker);
+    CHECK_THROWS(interrupt.throw_if_asked(), Interrupted);
 }
 
 }  // namespace
