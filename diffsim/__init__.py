@@ -5,7 +5,7 @@ from typing import Any
 from . import diagnostics, rotation, shapes
 from ._units import UnitsWarning
 from .materials import ClothMaterial
-from .ops import ConvergenceWarning, FastImpactWarning, Info, SolverError
+from .ops import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from .scene import BodyHandle, ClothHandle, Scene
 from .simulator import Simulator
 from .state import Control, State
@@ -16,7 +16,9 @@ __all__ = [
     "ClothMaterial",
     "Control",
     "ConvergenceWarning",
+    "Failure",
     "FastImpactWarning",
+    "GradientError",
     "Info",
     "Scene",
     "Simulator",

@@ -37,6 +37,8 @@ class Model:
         pinned: NDArray[np.uint8],
     ) -> None: ...
     @property
+    def names(self) -> list[str]: ...
+    @property
     def body_count(self) -> int: ...
     @property
     def cloth_count(self) -> int: ...
@@ -77,6 +79,8 @@ class Tape:
     @property
     def nbytes(self) -> int: ...
 
+class GradientFault(RuntimeError): ...  # of a backward; its args are scene, step, gradients, objects, nodes
+
 class Info:
     """Statistics of a rollout; counts are those of its last step."""
 
@@ -88,6 +92,10 @@ class Info:
     def fast_impacts(self) -> int: ...
     @property
     def failure(self) -> str: ...
+    @property
+    def failures(self) -> list[tuple[int, int, list[int], str, str, int, float]]: ...
+    @property
+    def scenes_converged(self) -> NDArray[np.bool]: ...
     @property
     def contacts(self) -> int: ...
     @property
@@ -134,6 +142,7 @@ def rollout_backward(
     *,
     needs: Sequence[bool],
     num_threads: int,
+    limit: float,
 ) -> tuple[NDArray[np.float64] | None, ...]: ...
 def contact_systems(
     tape: Tape, inputs: list[NDArray[np.float64] | None]

@@ -235,13 +235,17 @@ def _parameters(
     return checked, batch
 
 
-def check_unused(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    """Refuse values other than 0 of a parameter that contact makes no use of yet."""
+def check_unused(name: str, tensor: Tensor, shape: tuple[int, ...], objects: Sequence[str]) -> None:
+    """Refuse values other than 0 of a parameter that contact makes no use of yet. `objects`: their names."""
     if type(tensor) is not nn.Parameter or tensor.shape != shape:  # exchanged for this call
         check_shape("Simulator", name, check_float_tensor("Simulator", name, tensor), shape, None)
     values = _unwrapped_values(tensor) if torch._C._are_functorch_transforms_active() else tensor.numpy(force=True)
     if values.tobytes().strip(b"\0") and values.any():  # .any() alone takes half as long as a small step
-        raise NotImplementedError(f"Simulator: {name} must be 0, contact has none in this version yet")
+        whose = ""
+        if values.shape == shape:
+            index = int(np.flatnonzero(values)[0])
+            whose = f"; that of {(*objects, 'ground')[index]!r} (index {index}) is {values[index]:g}"
+        raise NotImplementedError(f"Simulator: {name} must be 0, contact has none in this version yet{whose}")
 
 
 def _unwrapped_values(tensor: Tensor) -> np.ndarray:

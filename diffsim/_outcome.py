@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
-from .ops import ConvergenceWarning, FastImpactWarning, Info
+import numpy as np
+import torch
+
+from .ops import ConvergenceWarning, Failure, FastImpactWarning, Info
+
+_MAX_FAILURES = 256  # the core lists no more of a segment
 
 # What to try, by why the core says a step failed.
 MENDS = {
@@ -17,18 +23,27 @@ MENDS = {
         "check what the kinematic bodies squeeze and how far they are driven, or try a smaller dt"
     ),
     "objects penetrate at the start": "move them apart, for instance with sim.separate(state)",
+    "a motion is too large for numbers to hold": "check states, controls and parameters for values out of proportion",
 }
 _USUAL_MEND = "try a smaller dt or a larger max_iterations"
 
 
-def combined(segments: list[Any]) -> Info:
-    """The statistics of a call from those of its segments."""
+def combined(segments: list[Any], names: Sequence[str]) -> Info:
+    """The statistics of a call from those of its segments; `names` are those of the bodies, then of the cloths."""
     last = segments[-1]
+    failures = [
+        Failure(scene, step, tuple(names[i] for i in objects), *why)
+        for segment in segments
+        for scene, step, objects, *why in segment.failures
+    ]
+    scenes_converged = np.logical_and.reduce([segment.scenes_converged for segment in segments])
     return Info(
         converged=all(segment.converged for segment in segments),
+        scenes_converged=torch.from_numpy(np.asarray(scenes_converged)),
         failed_steps=sum(segment.failed_steps for segment in segments),
         fast_impacts=sum(segment.fast_impacts for segment in segments),
-        failure=next((segment.failure for segment in segments if not segment.converged), ""),
+        failure=failures[0].reason if failures else "",
+        failures=failures[:_MAX_FAILURES],
         contacts=last.contacts,
         zones=last.zones,
         largest_zone=last.largest_zone,
@@ -41,11 +56,15 @@ def combined(segments: list[Any]) -> Info:
 
 def failure_text(info: Info, tolerance: float) -> str:
     """What to say about a call some of whose steps did not converge."""
+    first = info.failures[0]
+    scene = f" of scene {first.scene}" if info.scenes_converged.ndim else ""
+    bodies = ", ".join(map(repr, first.bodies))
+    cut = f", of which the first {_MAX_FAILURES} are listed" if info.failed_steps > len(info.failures) else ""
     return (
-        f"Simulator: {info.failed_steps} step(s) did not converge, the first because: {info.failure}. The last step"
-        f" of the call took {info.iterations} iterations to a relative residual of {info.residual:.3g} (tolerance"
-        f" {tolerance:g}). The last penetration-free state is returned;"
-        f" {MENDS.get(info.failure, _USUAL_MEND)}; see also sim.info"
+        f"Simulator: {info.failed_steps} step(s) did not converge, the first because: {first.reason}. It is step"
+        f" {first.step}{scene}: {bodies}; {first.iterations} iterations to a relative residual of {first.residual:.3g}"
+        f" (tolerance {tolerance:g}). The last penetration-free state is returned;"
+        f" {MENDS.get(first.reason, _USUAL_MEND)}; see also sim.info.failures{cut}"
     )
 
 

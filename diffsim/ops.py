@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,18 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from . import _core
-from ._check import CLOTH_PARAMETERS, CONTROL_FIELDS, PARAMETERS, STATE_FIELDS
+from ._check import CLOTH_PARAMETERS, CONTROL_FIELDS, PARAMETERS, STATE_FIELDS, message
 
-__all__ = ["ConvergenceWarning", "FastImpactWarning", "Info", "RolloutCall", "SolverError", "rollout"]
+__all__ = [
+    "ConvergenceWarning",
+    "Failure",
+    "FastImpactWarning",
+    "GradientError",
+    "Info",
+    "RolloutCall",
+    "SolverError",
+    "rollout",
+]
 
 # Whether torch.func transforms (vmap, grad, ...) are running. They dispatch through Function.apply; without them two
 # shortcuts are open that halve the cost of a call.
@@ -25,6 +34,8 @@ _transforms_active = torch._C._are_functorch_transforms_active
 _BASE_NDIM = (*(2,) * 6, *(2,) * 6, 1, 3, 1, *(1,) * 5)
 _INPUT_COUNT = len(_BASE_NDIM)
 _CONTROLS = range(6, 12)
+
+_LARGEST, _LARGEST_SINGLE = torch.finfo(torch.float64).max, torch.finfo(torch.float32).max
 
 OptionalTensors = tuple[Tensor | None, ...]
 
@@ -38,6 +49,22 @@ class ConvergenceWarning(UserWarning):
 
 
 @dataclass(frozen=True)
+class Failure:
+    """One step of one scene that did not converge."""
+
+    scene: int  #: index along the batch axis; 0 without one
+    step: int  #: index of the step in the rollout: the state it was taken from is that after `step` steps
+    #: names of the bodies and cloths it is about: what is squeezed and what squeezes it; the pair that penetrates; of a
+    #: group that was not solved all, but of a large one only the 8 whose forces balance least
+    bodies: tuple[str, ...]
+    #: in one word: "max_iterations", "no_descent", "spinning", "blocked", "penetrating" or "overflow"
+    status: str
+    reason: str  #: in a sentence
+    iterations: int  #: Newton iterations of the zone that took most
+    residual: float  #: KKT residual where iteration stopped, relative
+
+
+@dataclass(frozen=True)
 class Info:
     """Statistics of the last call of a simulator: of its last step, where nothing else is said.
 
@@ -45,8 +72,12 @@ class Info:
     """
 
     converged: bool  #: every step of every scene of the call
+    #: every step of each scene of the call, bool, shape (B,), or () where states have no batch axis: a mask for a loss
+    scenes_converged: Tensor = field(compare=False)
     failed_steps: int  #: steps of the call that did not converge, all scenes
     failure: str  #: why the first of them did not; "" if all converged
+    #: the failed steps, by step, then scene; the first 256, if `failed_steps` is more than that
+    failures: list[Failure]
     #: in all steps of the call, pairs of bodies that met while moving about as far in a step as the smaller is large
     #: (1.5 times its radius): such bodies can come around each other within a few steps
     fast_impacts: int
@@ -64,6 +95,7 @@ class SolverError(RuntimeError):
 
     Attributes:
         info: Statistics of the call; `iterations` and `residual` are those of its last step.
+        failures: Those of `info`: which steps of which scenes failed, over which bodies, and why.
         state: What the call would have returned: every configuration in it is free of penetration.
     """
 
@@ -72,10 +104,65 @@ class SolverError(RuntimeError):
         self.info = info
         self.iterations = info.iterations
         self.residual = info.residual
+        self.failures = info.failures
         self.state = state
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.args[0], self.info, self.state)
+
+
+class GradientError(RuntimeError):
+    """A backward gave numbers that are not finite (or, with a float32 state, too large for that) from finite ones.
+
+    Attributes:
+        scene: Index along the batch axis, 0 without one; -1 if only the sum over steps and scenes is not finite.
+        step: Index of the step in the rollout, or -1 likewise.
+        gradients: With respect to what: "state.velocity" (where that step starts), "control.force", "mass", ...
+        bodies: Names of the bodies and cloths whose gradients they are.
+        nodes: Of the cloths' nodes among them, indices into the node axis.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        scene: int,
+        step: int,
+        gradients: tuple[str, ...],
+        bodies: tuple[str, ...],
+        nodes: tuple[int, ...],
+    ) -> None:
+        super().__init__(text)
+        self.scene = scene
+        self.step = step
+        self.gradients = gradients
+        self.bodies = bodies
+        self.nodes = nodes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.args[0], self.scene, self.step, self.gradients, self.bodies, self.nodes)
+
+
+def _gradient_error(model: _core.Model, fault: _core.GradientFault) -> GradientError:
+    scene, step, gradients, objects, nodes = fault.args
+    bodies = tuple(model.names[i] for i in objects)
+    where = "in the sum over steps and scenes" if step < 0 else f"in step {step} of the rollout, scene {scene}"
+    whose = f", of {_listed(list(map(repr, bodies)))}" if bodies else ""
+    if nodes:
+        whose += f" (nodes {_listed(list(map(str, nodes)))} of the node axis)"
+    return GradientError(
+        f"diffsim: the gradient with respect to {', '.join(gradients)} is not finite {where}{whose}, though upstream"
+        " gradients are. Gradients that grow from step to step overflow in the end: use fewer steps, detach states on"
+        " the way, or scale the loss down. Where they do not grow, keep the step by ds.diagnostics.dump and report it",
+        scene,
+        step,
+        tuple(gradients),
+        bodies,
+        tuple(nodes),
+    )
+
+
+def _listed(entries: list[str], most: int = 8) -> str:
+    return ", ".join(entries[:most]) + (f" and {len(entries) - most} more" if len(entries) > most else "")
 
 
 class RolloutCall:
@@ -91,6 +178,7 @@ class RolloutCall:
         keep_tape: Whether the backward finds a record; without, it runs the forward again (checkpointing).
         want_signature: Whether `signature` is to be filled in.
         first_step: How many steps other calls made before, for error messages.
+        single: Whether gradients must fit into single precision, where a float32 state will have them.
 
     Attributes:
         info: Statistics, after the call.
@@ -109,6 +197,7 @@ class RolloutCall:
         "options",
         "record",
         "signature",
+        "single",
         "steps",
         "tape",
         "want_signature",
@@ -125,6 +214,7 @@ class RolloutCall:
         keep_tape: bool = True,
         want_signature: bool = False,
         first_step: int = 0,
+        single: bool = False,
     ) -> None:
         self.model = model
         self.options = options
@@ -135,6 +225,7 @@ class RolloutCall:
         self.keep_tape = keep_tape  # False: the backward runs the forward again instead (checkpointing)
         self.want_signature = want_signature
         self.first_step = first_step  # how many steps other calls made before
+        self.single = single
         self.record = False
         self.tape: _core.Tape | None = None
         self.info: _core.Info | None = None
@@ -225,7 +316,13 @@ class _RolloutBackward(torch.autograd.Function):
         inputs, upstream = arrays[:_INPUT_COUNT], arrays[_INPUT_COUNT:]
         tape = call.tape or _run(call, inputs, record=True).tape
         assert tape is not None  # it was recorded
-        grads = _core.rollout_backward(tape, inputs, upstream, needs=backward_call.needs, num_threads=call.num_threads)
+        limit = _LARGEST_SINGLE if call.single else _LARGEST
+        try:
+            grads = _core.rollout_backward(
+                tape, inputs, upstream, needs=backward_call.needs, num_threads=call.num_threads, limit=limit
+            )
+        except _core.GradientFault as fault:
+            raise _gradient_error(call.model, fault) from None
         return tuple(None if g is None else torch.from_numpy(g) for g in grads)
 
     @staticmethod

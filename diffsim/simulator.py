@@ -150,6 +150,7 @@ class Simulator(SceneIdentity, Measurements):
         self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
         self._parameter_shapes = torch.Size((n,)), torch.Size((n, 3, 3)), torch.Size((3,))
         self._object_shape = p.friction.shape
+        self._object_names = (*p.names, *p.cloth_names)
         self._separated: tuple[np.ndarray, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -186,7 +187,7 @@ class Simulator(SceneIdentity, Measurements):
     def info(self) -> Info | None:
         """Statistics of the last step; None before the first."""
         if isinstance(self._info, list):
-            self._info = combined(self._info)
+            self._info = combined(self._info, self._object_names)
         return self._info
 
     def __repr__(self) -> str:
@@ -245,7 +246,8 @@ class Simulator(SceneIdentity, Measurements):
         if self._check:
             self._check_unused_parameters()
         threads = self._num_threads or torch.get_num_threads()
-        call = RolloutCall(self._model, self._options, 1, threads)
+        single = state.position.dtype is torch.float32
+        call = RolloutCall(self._model, self._options, 1, threads, single=single)
         outputs = rollout(call, *inputs)  # type: ignore[arg-type]
         result = state_from(outputs, state)
         self._finish([call.info], result)
@@ -314,6 +316,7 @@ class Simulator(SceneIdentity, Measurements):
                     keep_tape=checkpoint_every is None or steps <= every,
                     want_signature=want_signature,
                     first_step=start,
+                    single=state.dtype is torch.float32,
                 )
                 part = driven
                 if has_time and count < steps:
@@ -340,8 +343,8 @@ class Simulator(SceneIdentity, Measurements):
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
     def _check_unused_parameters(self) -> None:
-        check_unused("friction", self.friction, self._object_shape)
-        check_unused("restitution", self.restitution, self._object_shape)
+        check_unused("friction", self.friction, self._object_shape, self._object_names)
+        check_unused("restitution", self.restitution, self._object_shape, self._object_names)
 
     def _finish(self, segments: list[Any], result: State) -> None:
         """Keeps the statistics of the call, and warns or raises if a step did not converge."""

@@ -8,7 +8,7 @@
 #include <string>
 #include <vector>
 
-#include "rollout.hpp"
+#include "rollout/rollout.hpp"
 
 /// Checked passage between numpy arrays and the views of the core.
 namespace diffsim::bindings {

@@ -165,6 +165,14 @@ const char* adjoint_text(AdjointMode mode) {
     return mode == AdjointMode::exact ? "exact" : mode == AdjointMode::qr ? "qr" : "dense";
 }
 
+/// Of bodies, then of cloths.
+std::vector<std::string> object_names(const Model& model) {
+    std::vector<std::string> names;
+    for (const Body& body : model.bodies) names.push_back(body.name);
+    for (const Cloth& cloth : model.cloths) names.push_back(cloth.name);
+    return names;
+}
+
 }  // namespace
 
 void bind_model(py::module_& module) {
@@ -177,6 +185,7 @@ void bind_model(py::module_& module) {
             py::arg("cloth_margin").noconvert(), py::arg("cloth_poisson").noconvert(),
             py::arg("node_count").noconvert(), py::arg("triangle_count").noconvert(), py::arg("triangles").noconvert(),
             py::arg("node_rest").noconvert(), py::arg("warp").noconvert(), py::arg("pinned").noconvert())
+        .def_property_readonly("names", &object_names)
         .def_property_readonly("body_count", &Model::body_count)
         .def_property_readonly("cloth_count", &Model::cloth_count)
         .def_property_readonly("node_count", &Model::node_count)

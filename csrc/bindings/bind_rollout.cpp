@@ -2,11 +2,13 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstring>
 #include <functional>
 #include <initializer_list>
 #include <numeric>
 #include <stdexcept>
+#include <tuple>
 
 #include "bindings/arrays.hpp"
 #include "bindings/bindings.hpp"
@@ -177,6 +179,34 @@ BatchedView<T> trajectory_view(T* data, const Leading& leading, bool keep_time, 
     return {data, keep_time ? leading.batch * size : 0, leading.has_batch ? size : 0};
 }
 
+/// Python's signals, looked for by the thread that called, while it holds no lock.
+class Signals {
+public:
+    /// Do work(interrupt) without the lock. What a signal's handler raised, KeyboardInterrupt say, is thrown on.
+    template <typename Work>
+    void watch(const Work& work) {
+        try {
+            const py::gil_scoped_release unlocked;
+            work(&m_interrupt);
+        } catch (...) {
+            if (m_raised) std::rethrow_exception(m_raised);
+            throw;
+        }
+        if (m_raised) std::rethrow_exception(m_raised);
+    }
+
+private:
+    bool raised() {
+        if (m_raised) return true;
+        const py::gil_scoped_acquire locked;
+        if (PyErr_CheckSignals() != 0) m_raised = std::make_exception_ptr(py::error_already_set());
+        return m_raised != nullptr;
+    }
+
+    std::exception_ptr m_raised;
+    Interrupt m_interrupt{[this] { return raised(); }};
+};
+
 struct Rollout {
     py::tuple trajectory;
     std::shared_ptr<Tape> tape;
@@ -202,12 +232,13 @@ Rollout bound_rollout(
         *slots[k] = trajectory_view(out.mutable_data(), leading, keep_time, core);
         result.trajectory[k] = std::move(out);
     }
-    const RolloutShape shape{steps, static_cast<int>(leading.batch), first_step, keep_time, controls_have_time};
+    const RolloutShape shape{
+        steps, static_cast<int>(leading.batch), first_step, keep_time, controls_have_time, leading.has_batch};
     std::vector<std::uint64_t> signatures;
-    {
-        py::gil_scoped_release unlocked;
-        result.info = rollout(model, options, shape, views, trajectory, signatures, result.tape.get(), num_threads);
-    }
+    Signals().watch([&](Interrupt* interrupt) {
+        result.info =
+            rollout(model, options, shape, views, trajectory, signatures, result.tape.get(), num_threads, interrupt);
+    });
     Shape signature_shape = {leading.steps};
     if (leading.has_batch) signature_shape.push_back(leading.batch);
     result.signature = py::array_t<std::uint64_t>(signature_shape);
@@ -215,9 +246,24 @@ Rollout bound_rollout(
     return result;
 }
 
+bool all_within(const Array& array, double limit) {
+    bool within = true;
+    for (const double *x = array.data(), *end = x + array.size(); x != end; ++x) within &= std::abs(*x) <= limit;
+    return within;
+}
+
+/// Raised with (scene, step, gradients, objects, nodes) of a GradientFault as its arguments.
+PyObject* gradient_fault_type = nullptr;
+
+[[noreturn]] void raise_fault(const GradientFault& fault) {
+    const py::tuple arguments = py::make_tuple(fault.scene, fault.step, fault.gradients, fault.objects, fault.nodes);
+    PyErr_SetObject(gradient_fault_type, arguments.ptr());
+    throw py::error_already_set();
+}
+
 py::tuple bound_backward(
     const std::shared_ptr<Tape>& tape, const InputArrays& inputs, const OutputArrays& upstream,
-    const std::array<bool, kInputCount>& needs, int num_threads) {
+    const std::array<bool, kInputCount>& needs, int num_threads, double limit) {
     const Fields fields = input_fields(*tape->model);
     const Leading leading = find_leading(inputs, fields, tape->shape.steps, tape->shape.controls_have_time);
     if (leading.batch != tape->shape.batch)
@@ -249,11 +295,17 @@ py::tuple bound_backward(
         *slots[k] = view_of(out.mutable_data(), fields[k], out.ndim(), leading);
         result[k] = std::move(out);
     }
-    {
-        py::gil_scoped_release unlocked;
-        rollout_backward(*tape, views, upstream_views, gradient, num_threads);
-    }
-    return result;
+    Signals().watch([&](Interrupt* interrupt) {
+        rollout_backward(*tape, views, upstream_views, gradient, num_threads, interrupt);
+    });
+    std::vector<std::string> faulty;
+    for (std::size_t k = 0; k < fields.size(); ++k)
+        if (!result[k].is_none() && !all_within(py::cast<Array>(result[k]), limit)) faulty.push_back(fields[k].name);
+    if (faulty.empty()) return result;
+    std::optional<GradientFault> fault = find_gradient_fault(*tape, views, upstream_views, gradient, limit);
+    if (!fault) return result;  // the caller's own: upstream is not finite
+    if (fault->gradients.empty()) fault->gradients = std::move(faulty);
+    raise_fault(*fault);
 }
 
 template <typename Matrix>
@@ -355,8 +407,50 @@ const char* failure_text(ZoneStatus status) {
             return "a driven body is blocked: something is squeezed";
         case ZoneStatus::bad_start:
             return "objects penetrate at the start";
+        case ZoneStatus::overflow:
+            return "a motion is too large for numbers to hold";
     }
     return "";
+}
+
+/// The same as one word.
+const char* status_text(ZoneStatus status) {
+    switch (status) {
+        case ZoneStatus::converged:
+            return "converged";
+        case ZoneStatus::too_many_iterations:
+            return "max_iterations";
+        case ZoneStatus::no_descent:
+            return "no_descent";
+        case ZoneStatus::spinning:
+            return "spinning";
+        case ZoneStatus::blocked:
+            return "blocked";
+        case ZoneStatus::bad_start:
+            return "penetrating";
+        case ZoneStatus::overflow:
+            return "overflow";
+    }
+    return "";
+}
+
+using FailureRow = std::tuple<int, int, std::vector<int>, std::string, std::string, int, double>;
+
+std::vector<FailureRow> failures(const RolloutInfo& info) {
+    std::vector<FailureRow> result;
+    for (const FailedStep& failed : info.failures)
+        result.emplace_back(
+            failed.scene, failed.step, failed.objects, status_text(failed.status), failure_text(failed.status),
+            failed.iterations, failed.residual);
+    return result;
+}
+
+py::array_t<bool> scenes_converged(const RolloutInfo& info) {
+    Shape shape;
+    if (info.has_batch) shape.push_back(static_cast<py::ssize_t>(info.scenes_converged.size()));
+    py::array_t<bool> result(shape);
+    std::copy(info.scenes_converged.begin(), info.scenes_converged.end(), result.mutable_data());
+    return result;
 }
 
 py::dict milliseconds(const RolloutInfo& info) {
@@ -371,6 +465,8 @@ py::dict milliseconds(const RolloutInfo& info) {
 }  // namespace
 
 void bind_rollout(py::module_& module) {
+    gradient_fault_type = py::exception<GradientFault>(module, "GradientFault", PyExc_RuntimeError).release().ptr();
+
     py::class_<Tape, std::shared_ptr<Tape>>(module, "Tape", "What the backward of a rollout needs.")
         .def_property_readonly("nbytes", &Tape::bytes);
 
@@ -379,6 +475,8 @@ void bind_rollout(py::module_& module) {
         .def_readonly("failed_steps", &RolloutInfo::failed_steps)
         .def_readonly("fast_impacts", &RolloutInfo::fast_impacts)
         .def_property_readonly("failure", [](const RolloutInfo& info) { return failure_text(info.status); })
+        .def_property_readonly("failures", &failures)
+        .def_property_readonly("scenes_converged", &scenes_converged)
         .def_property_readonly("contacts", [](const RolloutInfo& info) { return info.last.contacts; })
         .def_property_readonly("zones", [](const RolloutInfo& info) { return info.last.zones; })
         .def_property_readonly("largest_zone", [](const RolloutInfo& info) { return info.last.largest_zone; })
@@ -400,7 +498,9 @@ void bind_rollout(py::module_& module) {
 
     module.def(
         "rollout_backward", &bound_backward, py::arg("tape"), py::arg("inputs").noconvert(),
-        py::arg("upstream").noconvert(), py::kw_only(), py::arg("needs"), py::arg("num_threads"));
+        py::arg("upstream").noconvert(), py::kw_only(), py::arg("needs"), py::arg("num_threads"), py::arg("limit"),
+        "Gradients of the inputs. Raises GradientFault where upstream is finite and some number is not, or larger than "
+        "the limit.");
 
     module.def(
         "contact_systems", &bound_contact_systems, py::arg("tape"), py::arg("inputs").noconvert(),

@@ -7,6 +7,8 @@
 
 namespace diffsim {
 
+class Interrupt;
+
 enum class ZoneStatus {
     converged,
     too_many_iterations,
@@ -14,6 +16,7 @@ enum class ZoneStatus {
     spinning,    ///< never of a zone: a body turns further than its free motion can be solved for
     blocked,     ///< a driven body cannot reach its target: something is squeezed
     bad_start,   ///< objects at or below their pole at the start of the step
+    overflow,    ///< never of a zone: a motion is too large for numbers to hold
 };
 
 struct ZoneOptions {
@@ -22,6 +25,7 @@ struct ZoneOptions {
     /// Take this many full Newton steps, whether or not they lower the energy: for a zone without bodies and contacts, whose
     /// pinned nodes are at their targets from the first. Once from rest is Eq. 3 of [Qiao et al. 2020].
     std::optional<int> full_steps;
+    Interrupt* interrupt = nullptr;  ///< may be asked between iterations: whoever waits for a long zone may have gone
 };
 
 struct ZoneResult {

@@ -1,6 +1,7 @@
 #include "step/step.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cstdio>
 #include <stdexcept>
@@ -8,11 +9,16 @@
 #include <utility>
 
 #include "math/rotation.hpp"
+#include "step/failed_objects.hpp"
 #include "step/object_groups.hpp"
 #include "step/thread_memory.hpp"
 
 namespace diffsim {
 namespace {
+
+/// Numbers whose squares are larger count as overflown, be it on the way or in a state: what is computed from smaller ones
+/// is finite, and so it is where single precision is asked for.
+constexpr double kLargestSquare = 1e76;
 
 constexpr int kMaxBlocked = 2;     // shortenings of a blocked drive before it is stopped
 constexpr int kWorthSharing = 64;  // bodies and nodes to be solved for: fewer are done before a thread has woken up
@@ -62,6 +68,7 @@ struct StepWorkspace::ForwardScratch {
     std::vector<char> dirty;   ///< groups to be solved, at their smallest object
     ObjectGroups groups;
 
+    std::atomic<bool> overflow{false};
     Coordinates y;
     std::vector<Vec3> elastic_shift;  ///< with split coupling: each node's motion without contact
     PassiveBodies passive;
@@ -96,6 +103,7 @@ public:
         m_info = StepInfo{};
         Clock::time_point clock = Clock::now();
         predict();
+        if (m.overflow) return hold(m_state, ZoneStatus::overflow, overflown_objects(m_state), m_info, record);
         if (m_options.split) move_cloths_alone();
         m_info.seconds_motion = seconds_since(clock);
         for (int attempt = 0;; ++attempt) {
@@ -112,6 +120,7 @@ public:
         }
         find_zones();
         const SceneState result = finish();
+        if (m.overflow) return hold(m_state, ZoneStatus::overflow, overflown_objects(result), m_info, record);
         if (record != nullptr) write(*record);
         m_info.seconds_motion += seconds_since(clock);
         return result;
@@ -125,12 +134,17 @@ private:
 
     void predict() {
         const int count = m_model.body_count();
+        m.overflow = false;
         m.rotation.resize(static_cast<std::size_t>(count));
         m.y.resize(static_cast<std::size_t>(count), static_cast<std::size_t>(m_model.node_count()));
         m.bodies.resize(static_cast<std::size_t>(count));
         m_workspace.workers.for_each_range(count, kBodiesARange, [&](int begin, int end, int) {
-            for (int i = begin; i < end; ++i) predict_body(i);
+            for (int i = begin; i < end; ++i) {
+                predict_body(i);
+                if (overflows(i, m_state.bodies[i])) m.overflow = true;
+            }
         });
+        look_for_overflow_of_cloths(m_state);
         m.dynamic.clear();
         for (int i = 0; i < count; ++i)
             if (body(i).is_dynamic()) m.dynamic.push_back(i);
@@ -165,12 +179,15 @@ private:
             options.full_steps = m_options.newton_iterations;
             const ZoneResult result = solve_zone(zone, nobody, options, memory.workspace, memory.visited);
             note(result);
+            if (result.status != ZoneStatus::converged) fail(m_model.body_count() + c);
             const int first = m_model.cloths[c].first_node;
             for (int i = 0; i < zone.node_count(); ++i) m.elastic_shift[first + i] = memory.workspace.point.y.nodes[i];
         }
     }
 
-    ZoneOptions zone_options() const { return {m_options.tolerance, m_options.max_iterations, std::nullopt}; }
+    ZoneOptions zone_options() const {
+        return {m_options.tolerance, m_options.max_iterations, std::nullopt, m_workspace.interrupt};
+    }
 
     Vec3 origin_of(int object) const {
         return m_model.is_cloth(object) ? m_state.node_position[m_model.cloth_of(object).first_node]
@@ -190,6 +207,64 @@ private:
         }
         m_info.iterations = std::max(m_info.iterations, result.iterations);
         m_info.residual = std::max(m_info.residual, result.residual);
+    }
+
+    void fail(int object) {
+        std::vector<int>& failed = m_info.failed_objects;
+        const auto place = std::lower_bound(failed.begin(), failed.end(), object);
+        if (place == failed.end() || *place != object) failed.insert(place, object);
+    }
+
+    /// The group was not solved when it was last tried.
+    void fail_group(int root) {
+        m_workspace.for_each_memory([&](ThreadMemory& memory) {
+            for (const FailedGroup& failed : memory.results.failed)
+                if (failed.group == root)
+                    for (int object : failed.objects) fail(object);
+        });
+    }
+
+    // --- overflow ----------------------------------------------------------------------------------------------
+
+    bool overflows(int i, const BodyState& state) const {
+        // A spin that is too fast to be solved for stays what it is, however large.
+        const bool spinning = body(i).is_dynamic() && m.rotation[i].substeps == 0 && state.angular_velocity.allFinite();
+        const double spin_sq = spinning ? 0.0 : state.angular_velocity.squaredNorm();
+        return !(
+            m.y.bodies[i].squaredNorm() + state.position.squaredNorm() + state.velocity.squaredNorm() + spin_sq <=
+            kLargestSquare);
+    }
+
+    /// At the start of the step, where `state` moves as it is driven, or at its end.
+    bool cloth_overflows(int c, const SceneState& state) const {
+        const Cloth& cloth = m_model.cloths[c];
+        for (int k = 0; k < cloth.node_count(); ++k) {
+            const int i = cloth.first_node + k;
+            const double mass = m_parameters.cloths[c].density * cloth.node_area[k];
+            const Vec3& velocity = state.node_velocity[i];
+            const Vec3 driven =
+                cloth.pinned[k] != 0
+                    ? m_control.node_velocity[i]
+                    : free_node_velocity(velocity, m_control.node_force[i], mass, m_parameters, m_options.dt);
+            if (!(state.node_position[i].squaredNorm() + velocity.squaredNorm() + driven.squaredNorm() <=
+                  kLargestSquare))
+                return true;
+        }
+        return false;
+    }
+
+    void look_for_overflow_of_cloths(const SceneState& state) {
+        for (int c = 0; c < m_model.cloth_count(); ++c)
+            if (cloth_overflows(c, state)) m.overflow = true;
+    }
+
+    std::vector<int> overflown_objects(const SceneState& state) const {
+        std::vector<int> objects;
+        for (int i = 0; i < m_model.body_count(); ++i)
+            if (overflows(i, state.bodies[i])) objects.push_back(i);
+        for (int c = 0; c < m_model.cloth_count(); ++c)
+            if (cloth_overflows(c, state)) objects.push_back(m_model.body_count() + c);
+        return objects;
     }
 
     // --- who may meet whom -------------------------------------------------------------------------------------
@@ -316,9 +391,14 @@ private:
         outcome.thread = thread;
         keep_contacts(zone, point, outcome, own.results);
         if (outcome.result.status == ZoneStatus::converged) return;
-        for (int k = zone.dynamic_count; k < zone.body_count(); ++k)
-            if (point.y.bodies[k] != zone.bodies[k].target)
-                own.results.blocked.push_back({root, zone.bodies[k].id, point.y.bodies[k]});
+        std::vector<int> blocked;
+        for (int k = zone.dynamic_count; k < zone.body_count(); ++k) {
+            if (point.y.bodies[k] == zone.bodies[k].target) continue;
+            own.results.blocked.push_back({root, zone.bodies[k].id, point.y.bodies[k]});
+            blocked.push_back(zone.bodies[k].id);
+        }
+        own.results.failed.push_back(
+            {root, blocked.empty() ? unbalanced_objects(zone, point) : squeezed_objects(zone, point, blocked)});
     }
 
     static void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outcome, GroupResults& results) {
@@ -341,8 +421,9 @@ private:
     [[noreturn]] void refuse_start(const ZoneContact& contact, double distance) const {
         throw PenetratingStart(
             "state: '" + m_model.name(contact.contact.object_a) + "' and '" + m_model.name(contact.contact.object_b) +
-            "' penetrate: their meshes are " + number(distance) + " m apart, where at rest they keep " +
-            number(contact.range.rest) + " m; move them apart, for instance with sim.separate(state)");
+                "' penetrate: their meshes are " + number(distance) + " m apart, where at rest they keep " +
+                number(contact.range.rest) + " m; move them apart, for instance with sim.separate(state)",
+            contact.contact.object_a, contact.contact.object_b);
     }
 
     /// Groups whose objects were pushed to where they may have met others are to be solved again, together. False if there
@@ -361,6 +442,7 @@ private:
         m_info.converged = false;
         m_info.status = ZoneStatus::blocked;
         for (const BlockedDrive& blocked : m.blocked) {
+            fail_group(blocked.group);
             Vec6& y = m.y.bodies[blocked.body];
             if (stop)
                 y.setZero();
@@ -400,6 +482,7 @@ private:
             const GroupOutcome& outcome = m.outcomes[root];
             if (!outcome.solved) continue;
             note(outcome.result);
+            if (outcome.result.status != ZoneStatus::converged) fail_group(root);
             m_info.fast_impacts += outcome.result.fast_impacts;
             m_info.max_compression = std::max(m_info.max_compression, outcome.max_compression);
             m_info.signature = mix(m_info.signature, outcome.signature);
@@ -408,10 +491,14 @@ private:
             if (m.rotation[i].substeps > 0) continue;
             m_info.converged = false;
             if (m_info.status == ZoneStatus::converged) m_info.status = ZoneStatus::spinning;
+            fail(i);
         }
         SceneState result = m_state;
         m_workspace.workers.for_each_range(m_model.body_count(), kBodiesARange, [&](int begin, int end, int) {
-            for (int i = begin; i < end; ++i) finish_body(i, result.bodies[i]);
+            for (int i = begin; i < end; ++i) {
+                finish_body(i, result.bodies[i]);
+                if (overflows(i, result.bodies[i])) m.overflow = true;
+            }
         });
         for (const Cloth& cloth : m_model.cloths) {
             for (int k = 0; k < cloth.node_count(); ++k) {
@@ -421,6 +508,7 @@ private:
                     cloth.pinned[k] && m_info.converged ? m_control.node_velocity[node] : Vec3(m.y.nodes[node] / dt);
             }
         }
+        look_for_overflow_of_cloths(result);
         return result;
     }
 
@@ -497,10 +585,12 @@ SceneState step(
     return Stepper(model, options, parameters, state, control, workspace, info).run(record);
 }
 
-SceneState hold(const SceneState& state, StepInfo& info, StepRecord* record) {
+SceneState hold(
+    const SceneState& state, ZoneStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record) {
     info = StepInfo{};
     info.converged = false;
-    info.status = ZoneStatus::bad_start;
+    info.status = status;
+    info.failed_objects = std::move(objects);
     if (record != nullptr) {
         *record = StepRecord{};
         record->start = state;

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <memory>
 #include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "contact/adjoint.hpp"
@@ -10,6 +11,7 @@
 #include "contact/touching_zones.hpp"
 #include "contact/zone_solver.hpp"
 #include "model/state.hpp"
+#include "parallel/interrupt.hpp"
 #include "parallel/workers.hpp"
 #include "step/step_start.hpp"
 
@@ -39,12 +41,17 @@ struct StepInfo {
     double max_compression = 0.0;  ///< of a contact below its rest distance [m]
     int fast_impacts = 0;          ///< pairs of bodies with a fast ImpactGate
     double seconds_motion = 0.0, seconds_broad_phase = 0.0, seconds_zones = 0.0;
-    std::uint64_t signature = 0;  ///< hash of the active contacts and their types
+    std::uint64_t signature = 0;      ///< hash of the active contacts and their types
+    std::vector<int> failed_objects;  ///< bodies and cloths of what did not converge, ascending
 };
 
 /// Objects penetrate in the state a step was to start from; says which.
 class PenetratingStart : public std::invalid_argument {
-    using std::invalid_argument::invalid_argument;
+public:
+    PenetratingStart(const std::string& text, int object_a, int object_b)
+        : std::invalid_argument(text), a(object_a), b(object_b) {}
+
+    int a, b;  ///< b may be kGround
 };
 
 /// What it takes to solve a zone.
@@ -80,6 +87,7 @@ public:
     std::unique_ptr<ForwardScratch> forward;
     struct BackwardScratch;
     std::shared_ptr<BackwardScratch> backward;  ///< made by the first backward
+    Interrupt* interrupt = nullptr;             ///< of the computation that steps are part of, if it has one
 
 private:
     std::vector<std::unique_ptr<ThreadMemory>> m_memory;
@@ -92,13 +100,14 @@ public:
 inline constexpr int kBodiesARange = 128;
 
 /// Advance by options.dt. `record`, if given, receives what step_backward needs; it does not change the result.
-/// Throws PenetratingStart if objects penetrate at the start.
+/// Throws PenetratingStart if objects penetrate at the start. Where motions are too large for numbers to hold, all is held.
 SceneState step(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record);
 
-/// What a rollout puts in place of a step from a state that penetrates: the state, unchanged and not converged.
-SceneState hold(const SceneState& state, StepInfo& info, StepRecord* record);
+/// What takes the place of a step that cannot be taken because of these objects: the state, unchanged and not converged.
+SceneState hold(
+    const SceneState& state, ZoneStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record);
 
 /// d(loss)/d(Parameters).
 struct ParameterGradient {

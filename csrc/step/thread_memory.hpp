@@ -14,16 +14,24 @@ struct BlockedDrive {
     Vec6 reached;
 };
 
+/// Who a group that was not solved is about; see step/failed_objects.hpp.
+struct FailedGroup {
+    int group;
+    std::vector<int> objects;
+};
+
 /// What one thread collects of the groups it solves.
 struct GroupResults {
     std::vector<Contact> contacts;  ///< active, group after group
     std::vector<HardContact> hard;  ///< of theirs, if they are
     std::vector<BlockedDrive> blocked;
+    std::vector<FailedGroup> failed;  ///< also of groups that were joined by others and solved again
 
     void clear() {
         contacts.clear();
         hard.clear();
         blocked.clear();
+        failed.clear();
     }
 };
 
