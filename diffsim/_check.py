@@ -64,7 +64,7 @@ def check_float_tensor(where: str, name: str, value: Any, dtype: torch.dtype | N
     if value.device.type != "cpu":
         raise ValueError(message(where, name, "be on the cpu, the only device diffsim runs on", value.device))
     if value.layout is not torch.strided:
-        raise TypeError(message(where, name, "be a dense tensor", value.layout))
+        raise TypeError(message(where, name, "be a dense tensor (use .to_dense())", value.layout))
     if value.dtype not in FLOAT_DTYPES:
         raise TypeError(message(where, name, "have dtype torch.float32 or torch.float64", value.dtype))
     if dtype is not None and value.dtype is not dtype:

@@ -97,7 +97,7 @@ def green_strain(x: Tensor, elements: ClothElements) -> Tensor:
     """ε = ½ (FᵀF - 1) of each triangle as ε11, ε22, ε12: (..., n, 3) -> (..., t, 3)."""
     x0, x1, x2 = (x.index_select(-2, elements.triangles[:, k]) for k in range(3))
     F = torch.stack([x1 - x0, x2 - x0], dim=-1) @ elements.rest_inverse
-    strain = 0.5 * (F.mT @ F - torch.eye(2, dtype=x.dtype))
+    strain = 0.5 * (F.mT @ F - torch.eye(2, dtype=x.dtype, device=x.device))
     return torch.stack([strain[..., 0, 0], strain[..., 1, 1], strain[..., 0, 1]], dim=-1)
 
 

@@ -57,7 +57,7 @@ def angular_momentum(state: State, mass: Tensor, inertia: Tensor, node_mass: Ten
 
 def _frames(R: Tensor, origin: Tensor) -> Tensor:
     top = torch.cat((R, origin.unsqueeze(-1)), dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=_F64).expand(*R.shape[:-2], 1, 4)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=_F64, device="cpu").expand(*R.shape[:-2], 1, 4)
     return torch.cat((top, bottom), dim=-2)
 
 

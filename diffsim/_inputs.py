@@ -216,7 +216,7 @@ def _stacked(
                     f"{where}: controls[{step}].{name} is None, others are not; give it in all steps or none"
                 )
             count = node_count if name.startswith("node") else body_count
-            column = [torch.zeros(count, 3, dtype=dtype) if t is None else t for t in column]
+            column = [torch.zeros(count, 3, dtype=dtype, device="cpu") if t is None else t for t in column]
         stacked.append(torch.stack(torch.broadcast_tensors(*column)) if given else None)
     return stacked, any(t is not None for t in stacked), batch
 

@@ -109,7 +109,7 @@ class Measurements(nn.Module):
         self._check_state("min_distance", state)
         self._refuse_transforms("min_distance")
         if not state.position.numel() and not state.node_position.numel():  # nothing there, or no scene
-            nothing = torch.full(state.leading_shape, torch.inf, dtype=state.dtype)
+            nothing = torch.full(state.leading_shape, torch.inf, dtype=state.dtype, device="cpu")
             return nothing if nothing.ndim else torch.inf
         found = self._for_each_scene(lambda *x: (_core.min_distance(self._model, *x)[0],), state)[0]
         return torch.from_numpy(found).to(state.dtype) if found.ndim else float(found)

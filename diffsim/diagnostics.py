@@ -155,7 +155,7 @@ def gradcheck(
     check_instance(where, "state", state, State, "be a diffsim.State")
     directions = check_count(where, "directions", directions)
     eps = check_number(where, "eps", eps, above=0.0)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator("cpu").manual_seed(seed)
     inputs = _inputs(where, sim, state, controls, check_count(where, "steps", steps))
     names = list(inputs) if wrt is None else list(wrt)
     for name in names:
@@ -289,7 +289,7 @@ def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps:
 
 
 def _normal(shape: torch.Size, generator: torch.Generator) -> Tensor:
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64, device="cpu")
 
 
 def _mean_inertia(inertia: Tensor) -> Tensor:

@@ -242,6 +242,13 @@ def _arrays(tensors: Sequence[Tensor | None]) -> list[Any]:
     return [None if t is None else _array(t) for t in tensors]
 
 
+def _refuse_sparse(inputs: Sequence[Tensor | None]) -> None:
+    """Looked for once something has gone wrong: to ask every tensor of every call would take too long."""
+    for name, t in zip(_INPUT_NAMES, inputs):
+        if t is not None and t.layout is not torch.strided:
+            raise TypeError(message("Simulator", name, "be a dense tensor (use .to_dense())", t.layout))
+
+
 def _run(call: RolloutCall, arrays: list[Any], record: bool) -> _core.Rollout:
     return _core.rollout(
         call.model,
@@ -261,7 +268,12 @@ class _Rollout(torch.autograd.Function):
     # operator of its own (for vmap over the backward, as in jacrev), and its backward says no.
     @staticmethod
     def forward(call: RolloutCall, *inputs: Tensor | None) -> OptionalTensors:
-        result = _run(call, _arrays(inputs), call.record)
+        try:
+            arrays = _arrays(inputs)
+        except RuntimeError:
+            _refuse_sparse(inputs)
+            raise
+        result = _run(call, arrays, call.record)
         call.tape = result.tape
         call.info = result.info
         if call.want_signature:
@@ -287,6 +299,10 @@ class _Rollout(torch.autograd.Function):
         return None, *_RolloutBackward.forward(call, *ctx.saved_tensors, *grads)
 
     @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # of a gradient: other tangents show in the inputs, and are refused there
+        raise NotImplementedError(_FIRST_ORDER_ONLY)
+
+    @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], call: RolloutCall, *inputs: Tensor | None) -> Any:
         folded, batch = _fold_inputs(call, info.batch_size, in_dims[1:], inputs)
         # A tensor hides from the outside of vmap whether it requires grad; here, one level further down, it shows.
@@ -295,6 +311,12 @@ class _Rollout(torch.autograd.Function):
         outputs = _Rollout.apply(call, *folded)
         unfolded = tuple(None if t is None else _unfold(t, info.batch_size, batch, time) for t in outputs)
         return unfolded, tuple(None if t is None else time for t in unfolded)
+
+
+_FIRST_ORDER_ONLY = (
+    "diffsim: gradients are first order only; a second derivative through a step was asked for (create_graph=True,"
+    " hessian, or a gradient of a gradient)"
+)
 
 
 class _BackwardCall:
@@ -311,7 +333,12 @@ class _RolloutBackward(torch.autograd.Function):
     @staticmethod
     def forward(backward_call: _BackwardCall, *tensors: Tensor | None) -> OptionalTensors:
         call = backward_call.call
-        arrays = _arrays(tensors)
+        try:
+            arrays = _arrays(tensors)
+        except RuntimeError:  # no plain tensors
+            if any(t is not None and _is_legacy_batched(t) for t in tensors):
+                return _legacy_rows(backward_call, tensors)
+            arrays = _arrays([t if t is None else t.to_dense() for t in tensors])
         # Without a tape, checkpointing: the same bits again, recorded this time, and dropped after use.
         inputs, upstream = arrays[:_INPUT_COUNT], arrays[_INPUT_COUNT:]
         tape = call.tape or _run(call, inputs, record=True).tape
@@ -331,10 +358,11 @@ class _RolloutBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> OptionalTensors:
-        raise NotImplementedError(
-            "diffsim: gradients are first order only; a second derivative through a step was asked for"
-            " (create_graph=True, hessian, or a gradient of a gradient)"
-        )
+        raise NotImplementedError(_FIRST_ORDER_ONLY)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise NotImplementedError(_FIRST_ORDER_ONLY)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], backward_call: _BackwardCall, *tensors: Tensor | None) -> Any:
@@ -359,6 +387,30 @@ class _RolloutBackward(torch.autograd.Function):
             for t, dim, grad, base, time in zip(tensors, dims, grads, _BASE_NDIM, _times(call))
         )
         return outputs, tuple(None if t is None else 0 for t in outputs)
+
+
+_is_legacy_batched = torch._C._functorch.is_legacy_batchedtensor
+
+
+def _legacy_rows(backward_call: _BackwardCall, tensors: tuple[Tensor | None, ...]) -> OptionalTensors:
+    """Under the vmap of `is_grads_batched` and `autograd.functional`, which knows no rules of Functions: it hands over
+    upstream gradients with an axis that is hidden from all but its own two functions.
+    """
+    level = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    hidden = [t is not None and _is_legacy_batched(t) for t in tensors]
+    shown = [torch._remove_batch_dim(t, level, 1, 0) if h else t for t, h in zip(tensors, hidden)]
+    if any(t is not None and _is_legacy_batched(t) for t in shown):
+        raise NotImplementedError(
+            "diffsim: there is no is_grads_batched within is_grads_batched; use torch.func.jacrev"
+        )
+    size = next(len(t) for t, h in zip(shown, hidden) if t is not None and h)
+    rows = [
+        _RolloutBackward.forward(backward_call, *(t[i] if t is not None and h else t for t, h in zip(shown, hidden)))
+        for i in range(size)
+    ]
+    columns = (None if column[0] is None else torch.stack(column) for column in zip(*rows))
+    return tuple(None if t is None else torch._add_batch_dim(t, 0, level) for t in columns)
 
 
 def _any_requires_grad(tensors: Any) -> bool:

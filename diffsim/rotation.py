@@ -124,7 +124,9 @@ def _apply(function: Callable[..., Tensor], first: Array, *others: Any) -> Array
     if like is None:
         result: Any = function(*(torch.from_numpy(np.array(a, dtype=np.float64)) for a in arrays)).numpy()
         return cast("Array", result)
-    result = function(*(a if isinstance(a, Tensor) else torch.as_tensor(a, dtype=like.dtype) for a in arrays))
+    result = function(
+        *(a if isinstance(a, Tensor) else torch.as_tensor(a, dtype=like.dtype, device=like.device) for a in arrays)
+    )
     return cast("Array", result)
 
 
@@ -250,6 +252,6 @@ def _rpy_jacobian(rpy: Tensor, p: Tensor) -> Tensor:
 def _rpy_mass_matrix(rpy: Tensor, mass: Tensor, inertia: Tensor) -> Tensor:
     body_rates = _to_matrix(_from_rpy(rpy)).mT @ _rpy_rates_matrix(rpy)
     upper = body_rates.mT @ inertia @ body_rates
-    lower = mass[..., None, None] * torch.eye(3, dtype=rpy.dtype)
+    lower = mass[..., None, None] * torch.eye(3, dtype=rpy.dtype, device=rpy.device)
     zero = torch.zeros_like(upper) * torch.zeros_like(lower)  # has the leading axes of both
     return torch.cat([torch.cat([upper + zero, zero], -1), torch.cat([zero, lower + zero], -1)], -2)
