@@ -1,4 +1,4 @@
-"""What a user can look at in a scene of their own: are the gradients right, and what system do they solve?"""
+"""What a user can look at in a scene of their own: are gradients right, what system do they solve, what went wrong?"""
 
 from __future__ import annotations
 
@@ -23,11 +23,21 @@ from ._check import (
     check_instance,
     check_number,
 )
+from ._dump import Replay, dump, replay
 from ._inputs import Controls, over_time
 from .simulator import Simulator
 from .state import Control, State
 
-__all__ = ["ContactSystem", "DirectionCheck", "GradcheckReport", "contact_systems", "gradcheck"]
+__all__ = [
+    "ContactSystem",
+    "DirectionCheck",
+    "GradcheckReport",
+    "Replay",
+    "contact_systems",
+    "dump",
+    "gradcheck",
+    "replay",
+]
 
 # A control that has the name of a field of the state is called otherwise here.
 _CONTROL_NAMES = {name: {"node_velocity": "node_drive"}.get(name, name) for name in CONTROL_FIELDS}

@@ -23,7 +23,7 @@ from ._identity import SceneIdentity
 from ._inputs import Controls, Inputs, check_unused, checked_inputs, plain_inputs, state_from
 from ._measurements import Measurements
 from ._outcome import combined, failure_text, warn_of_failure, warn_of_fast_impacts
-from ._packed import core_model
+from ._packed import PackedScene, core_model
 from ._progress import progress_bar
 from .ops import Info, RolloutCall, SolverError, rollout
 from .scene import Scene
@@ -110,9 +110,8 @@ class Simulator(SceneIdentity, Measurements):
         check_choice(where, "zones", zones, ("local", "global"))
         check_choice(where, "on_failure", on_failure, ("warn", "raise"))
         compliance = check_number(where, "compliance", compliance, least=0.0)
-        self._dt = check_number(where, "dt", dt, above=0.0)
-        self._settings: dict[str, Any] = {
-            "dt": self._dt,
+        settings: dict[str, Any] = {
+            "dt": check_number(where, "dt", dt, above=0.0),
             "compliance": compliance,
             "adjoint": adjoint,
             "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
@@ -120,15 +119,36 @@ class Simulator(SceneIdentity, Measurements):
             "zones": zones,
             "newton_iterations": _checked_iterations(newton_iterations, coupling),
         }
-        self._num_threads = None if num_threads is None else check_count(where, "num_threads", num_threads)
-        self._on_failure = on_failure
-        self._check = bool(check)
-        self._packed = scene.pack(None if thickness is None else check_number(where, "thickness", thickness, above=0.0))
-        if self._check:
-            scene.validate(self._packed)
+        threads = None if num_threads is None else check_count(where, "num_threads", num_threads)
+        packed = scene.pack(None if thickness is None else check_number(where, "thickness", thickness, above=0.0))
+        if check:
+            scene.validate(packed)
         if max_iterations is None:
-            max_iterations = _CLOTH_ITERATIONS if self._packed.cloth_names else _ITERATIONS
-        self._settings["max_iterations"] = check_count(where, "max_iterations", max_iterations)
+            max_iterations = _CLOTH_ITERATIONS if packed.cloth_names else _ITERATIONS
+        settings["max_iterations"] = check_count(where, "max_iterations", max_iterations)
+        self._begin(packed, settings, threads, on_failure, bool(check))
+        if self._check:
+            self._separate_scene()
+
+    @classmethod
+    def _of_packed(
+        cls, packed: PackedScene, settings: dict[str, Any], num_threads: int | None, on_failure: str, check: bool
+    ) -> Simulator:
+        """One whose scene and settings have been checked before."""
+        sim = cls.__new__(cls)
+        nn.Module.__init__(sim)
+        sim._begin(packed, settings, num_threads, on_failure, check)
+        return sim
+
+    def _begin(
+        self, packed: PackedScene, settings: dict[str, Any], num_threads: int | None, on_failure: str, check: bool
+    ) -> None:
+        self._packed = packed
+        self._settings = settings
+        self._dt: float = settings["dt"]
+        self._num_threads = num_threads
+        self._on_failure = on_failure
+        self._check = check
         for name in (*PARAMETERS, "friction", "restitution", *CLOTH_PARAMETERS):
             value = torch.from_numpy(np.array(getattr(self._packed, name), dtype=np.float64))
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
@@ -136,8 +156,6 @@ class Simulator(SceneIdentity, Measurements):
         self._warned = False
         self._warned_fast = False
         self._build()
-        if self._check:
-            self._separate_scene()
 
     def _build(self) -> None:
         """What is made from the packed scene and cannot be pickled."""
