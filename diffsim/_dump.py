@@ -52,7 +52,7 @@ def dump(sim: Simulator, state: State, control: Control | None, path: str | Path
     """
     check_instance("dump", "sim", sim, Simulator, "be a diffsim.Simulator")
     sim._checked_inputs("dump", state, control, None)
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     scene: dict[str, Any] = {}
     for name in _FIELDS:
         value = getattr(sim._packed, name)

@@ -399,7 +399,7 @@ def _legacy_rows(backward_call: _BackwardCall, tensors: tuple[Tensor | None, ...
     level = torch._C._vmapmode_increment_nesting() - 1
     torch._C._vmapmode_decrement_nesting()
     hidden = [t is not None and _is_legacy_batched(t) for t in tensors]
-    shown = [torch._remove_batch_dim(t, level, 1, 0) if h else t for t, h in zip(tensors, hidden)]
+    shown = [torch._remove_batch_dim(t, level, 1, 0) if t is not None and h else t for t, h in zip(tensors, hidden)]
     if any(t is not None and _is_legacy_batched(t) for t in shown):
         raise NotImplementedError(
             "diffsim: there is no is_grads_batched within is_grads_batched; use torch.func.jacrev"
