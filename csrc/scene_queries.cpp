@@ -40,7 +40,7 @@ void check_separation(const Model& model, const Separation& separation, const Sc
         " for the thickness: their meshes are " + number(separation.distance) + " m apart where they need " +
             number(separation.rest) + " m, and moving them brings them too near to something else; they lack " +
             number(separation.rest - separation.distance) + " m. Give a smaller thickness (it is " +
-            number(model.thickness) + " m), or make room");
+            number(model.pair_thickness(a, b)) + " m), or make room");
 }
 
 }  // namespace
@@ -178,14 +178,14 @@ private:
     void measure_ground(int object) {
         const PlacedObject placed(m_model, m_state, object, Vec3::Zero());
         const Surface surface = placed.surface();
-        const double keep = m_model.ground.height + m_model.margin(object) + m_model.ground.margin;
+        const double keep = m_model.ground.height + m_model.margin_sum(object, kGround);
         for (int v : placed.mesh->active_vertices) consider(surface.vertex(v).z() - keep, object, kGround);
     }
 
     void measure_pair(int a, int b) {
         const Vec3 origin = origin_of(a);
         PlacedObject placed_a(m_model, m_state, a, origin), placed_b(m_model, m_state, b, origin);
-        const double margins = m_model.margin(a) + m_model.margin(b);
+        const double margins = m_model.margin_sum(a, b);
         const Box box_a = placed_a.box(), box_b = placed_b.box();
         const Vec3 gap = (box_a.lower - box_b.upper).cwiseMax(box_b.lower - box_a.upper).cwiseMax(0.0);
         if (gap.norm() - margins >= m_nearest.distance) return;

@@ -16,13 +16,13 @@ from ._cloth_shape import ClothShape
 from ._mass_properties import FloatArray, IntArray
 from .materials import ClothMaterial
 
-# The default thickness as a fraction of the smallest extent in the scene; without any extent, of one metre.
+# The default thickness of an object as a fraction of its smallest extent; of a scene without objects, of one metre.
 _RELATIVE_THICKNESS = 1e-3
 # And at most this fraction of the smallest height of a cloth's triangles: neighbours at rest are that far apart, and
 # the contact between them must stay out of it when the cloth is compressed and folded sharply.
 _HEIGHT_FRACTION = 0.1
-# A side of a mesh's box shorter than this fraction of its longest is rounding of a flat mesh, not an extent.
-_FLAT = 1e-9
+# A closed mesh whose box is thinner than this fraction of its second shortest side is flat up to rounding in float32.
+_FLAT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,10 @@ class PackedScene:
     gravity: FloatArray  #: shape (3,)  [m/s²]
     has_ground: bool
     ground_height: float  #: the half-space z <= ground_height is solid; 0 without ground  [m]
-    ground_margin: float  #: resolved; 0 without ground  [m]
-    thickness: float  #: distance kept between surfaces of default margin  [m]
+    ground_margin: float | None  #: None: half the thickness of what meets the ground; 0 without ground  [m]
+    thickness: float  #: distance kept between surfaces of default margin: the largest of `object_thickness`  [m]
+    #: of bodies, then cloths, shape (n + c,): twice the default margin; a pair's is the mean of both  [m]
+    object_thickness: FloatArray
 
 
 @dataclass(frozen=True)
@@ -114,21 +116,27 @@ def pack_scene(
     thickness: float | None,
 ) -> PackedScene:
     """As `Scene.pack` says."""
+    ground_margin = 0.0 if ground is None else ground.margin
     if thickness is None:
-        thickness = _default_thickness(bodies, cloths)
-    thickness = positive(thickness, "thickness", "m")
+        own = _default_thickness(bodies, cloths)
+        thickness = float(own.max()) if own.size else _RELATIVE_THICKNESS
+    else:
+        thickness = positive(thickness, "thickness", "m")
+        own = np.full(len(bodies) + len(cloths), thickness)
+        ground_margin = _resolve(ground_margin, thickness)
+    cloth_margin = [_resolve(c.margin, t) for c, t in zip(cloths, own[len(bodies) :], strict=True)]
     shapes = [body.shape for body in bodies]
     sheets = [cloth.shape for cloth in cloths]
     objects: list[Body | Cloth | Ground] = [*bodies, *cloths, *([] if ground is None else [ground])]
-    for cloth in cloths:
-        _require_coarser_than_thick(cloth, _resolve(cloth.margin, thickness))
+    for cloth, margin in zip(cloths, cloth_margin, strict=True):
+        _require_coarser_than_thick(cloth, margin)
     orientation = _stack([b.orientation for b in bodies], (4,))
     mesh_offset = _stack([s.center for s in shapes], (3,))
     placed = [b.position + rotation_matrix(b.orientation) @ b.shape.center for b in bodies]
     return PackedScene(
         names=[b.name for b in bodies],
         kind=np.array([KINDS.index(b.kind) for b in bodies], dtype=np.int32),
-        margin=np.array([0.5 * thickness if s.margin is None else s.margin for s in shapes], dtype=np.float64),
+        margin=np.array([_resolve(s.margin, t) for s, t in zip(shapes, own)], dtype=np.float64),
         vertex_count=np.array([len(s.vertices) for s in shapes], dtype=np.int32),
         vertices=np.concatenate([np.zeros((0, 3)), *(s.vertices - s.center for s in shapes)]),
         face_count=np.array([len(s.faces) for s in shapes], dtype=np.int32),
@@ -141,7 +149,7 @@ def pack_scene(
         inertia=_stack([s.inertia for s in shapes], (3, 3)),
         mesh_offset=mesh_offset,
         cloth_names=[c.name for c in cloths],
-        cloth_margin=np.array([_resolve(c.margin, thickness) for c in cloths], dtype=np.float64),
+        cloth_margin=np.array(cloth_margin, dtype=np.float64),
         **{
             f"cloth_{field}": np.array([getattr(c.material, field) for c in cloths], dtype=np.float64)
             for field in ("poisson", "density", "stretch", "shear", "bend", "damping")
@@ -161,20 +169,36 @@ def pack_scene(
         gravity=gravity.copy(),
         has_ground=ground is not None,
         ground_height=0.0 if ground is None else ground.height,
-        ground_margin=0.0 if ground is None else _resolve(ground.margin, thickness),
+        ground_margin=ground_margin,
         thickness=thickness,
+        object_thickness=own,
     )
 
 
-def _default_thickness(bodies: Sequence[Body], cloths: Sequence[Cloth]) -> float:
-    smallest = math.inf
-    for body in bodies:
-        sides = np.ptp(body.shape.vertices, axis=0) + 2.0 * (body.shape.margin or 0.0)
-        smallest = min(smallest, float(sides[sides > _FLAT * sides.max()].min()))
-    for cloth in cloths:  # its width: how far a sheet is from flat, or how thick, says nothing about the scene
-        smallest = min(smallest, float(np.sort(np.ptp(cloth.shape.vertices, axis=0))[1]))
-    thickness = _RELATIVE_THICKNESS * (smallest if math.isfinite(smallest) else 1.0)
-    return min([thickness, *(_HEIGHT_FRACTION * cloth.shape.smallest_height for cloth in cloths)])
+def _default_thickness(bodies: Sequence[Body], cloths: Sequence[Cloth]) -> FloatArray:
+    """Of each object, bodies first."""
+    of_bodies = [_RELATIVE_THICKNESS * _smallest_extent(body.shape) for body in bodies]
+    of_cloths = [
+        min(_RELATIVE_THICKNESS * _sides(cloth.shape.vertices)[1], _HEIGHT_FRACTION * cloth.shape.smallest_height)
+        for cloth in cloths
+    ]
+    # What does not yield may be a landscape: what moves over it does not see how large it is.
+    moves = [body.kind == "dynamic" for body in bodies]
+    most = max([*(t for t, yields in zip(of_bodies, moves) if yields), *of_cloths], default=math.inf)
+    return np.array([t if yields else min(t, most) for t, yields in zip(of_bodies, moves)] + of_cloths)
+
+
+def _smallest_extent(shape: Shape) -> float:
+    """Shortest side of its box; of a surface that is open or flat the second: how far it is from flat is no extent."""
+    if shape.margin is not None:
+        return float(_sides(shape.vertices)[0] + 2.0 * shape.margin)
+    shortest, second, _ = _sides(shape.vertices)
+    return float(shortest if shape.closed and shortest > _FLAT * second else second)
+
+
+def _sides(vertices: FloatArray) -> FloatArray:
+    """Of their box, the shortest first, shape (3,)."""
+    return np.asarray(np.sort(np.ptp(vertices, axis=0)))
 
 
 def _placed(cloth: Cloth) -> FloatArray:
@@ -224,7 +248,7 @@ def core_model(p: PackedScene) -> _core.Model:
         has_ground=p.has_ground,
         ground_height=p.ground_height,
         ground_margin=p.ground_margin,
-        thickness=p.thickness,
+        thickness=p.object_thickness,
         cloth_names=list(p.cloth_names),
         cloth_margin=p.cloth_margin,
         cloth_poisson=p.cloth_poisson,

@@ -55,7 +55,7 @@ class Scene:
             height: [m]
             friction: 0, as for `add_body`.
             restitution: 0, as for `add_body`.
-            margin: Distance of the collision surface above `height` [m]. Default: half of the simulator's thickness.
+            margin: Distance of the collision surface above `height` [m]. Default: half the thickness of what meets it.
         Raises: ValueError, NotImplementedError as `add_body`; ValueError for a second ground.
         """
         if self._ground is not None:
@@ -108,7 +108,8 @@ class Scene:
             kind: "dynamic", "static" (never moves) or "kinematic" (moves as told, pushes others, is not pushed).
             friction: 0; contact is frictionless for now.
             restitution: 0; contact is inelastic for now.
-            margin: Distance of the collision surface from the mesh [m]. Default: half of the simulator's thickness.
+            margin: Distance of the collision surface from the mesh [m]. Default: half of the body's thickness, see
+                `pack`.
             scale: Metres in a unit of the mesh: 0.001 for a mesh in millimetres. Vertices are multiplied with it before
                 anything is made of them; all other arguments are in SI units and are not.
             name: For error messages and pictures, unique. Default: "body_" and its index.
@@ -232,7 +233,7 @@ class Scene:
             warp: Direction of the warp's threads in the frame of the rest shape, shape (3,); on each triangle, what of
                 it lies in its plane. Default: the x axis.
             margin: Distance of the collision surface from the mesh, to both sides [m]: half of the cloth's thickness.
-                Default: half of the simulator's thickness.
+                Default: half of the simulator's thickness, or of its own, see `pack`.
             scale: Metres in a unit of the mesh, and of `rest`, as for `add_body`.
             friction: 0, as for `add_body`.
             restitution: 0, as for `add_body`.
@@ -273,11 +274,12 @@ class Scene:
         """The scene as arrays.
 
         Args:
-            thickness: Distance kept between surfaces of default margin [m]. Default: 1e-3 of the smallest extent in the
-                scene, that is of the shortest side of any body's bounding box along its mesh's axes, margins that were
-                given (so also the radius of spheres and capsules) included, sides of length zero (of a flat static
-                mesh) left out, or of the second longest side of a cloth's box, its width; 1e-3 m if there is no object.
-                With cloth, at most 0.1 of the smallest height of its triangles, which must stay clear of each other.
+            thickness: Distance kept between surfaces of default margin [m]. Default: each object has its own, and a
+                pair keeps the mean of both: 1e-3 of the shortest side of its bounding box along its mesh's axes, a
+                margin that was given (so also the radius of spheres and capsules) included; of the second shortest for
+                a mesh that is open, or flat up to rounding, and for a cloth (its width). A cloth has at most 0.1 of the
+                smallest height of its triangles, which must stay clear of each other; static and kinematic bodies at
+                most what the thickest object has that yields; the ground takes that of what meets it.
         Returns: One array per field, see `PackedScene`.
         Raises: ValueError for a thickness that is not positive, or a cloth with triangles smaller than it is thick.
         """

@@ -52,7 +52,8 @@ class Simulator(SceneIdentity, Measurements):
     Args:
         scene: Read now; later changes to it have no effect.
         dt: Time step [s].
-        thickness: Distance kept between surfaces of default margin [m]. Default: 1e-3 of the scene's smallest extent.
+        thickness: Distance kept between surfaces of default margin [m]. Default: 1e-3 of the smallest extent of each
+            object, and the mean of both between two (`Scene.pack` tells the rest).
         compliance: How far contacts give way: about this part of what gravity moves a body in one step. 0: not at all,
             at the price of a few more Newton steps (the quadratic program of Eq. 6 as written).
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
@@ -188,7 +189,7 @@ class Simulator(SceneIdentity, Measurements):
 
     @property
     def thickness(self) -> float:
-        """Distance kept between surfaces of default margin [m]."""
+        """Distance kept between surfaces of default margin [m]; of the thickest object, if each has its own."""
         return float(self._packed.thickness)
 
     @property

@@ -1,5 +1,7 @@
 #include <pybind11/stl.h>
 
+#include <algorithm>
+#include <optional>
 #include <stdexcept>
 
 #include "bindings/arrays.hpp"
@@ -74,15 +76,21 @@ std::vector<Cloth> make_cloths(const ClothArrays& arrays) {
 std::shared_ptr<Model> make_model(
     const std::vector<std::string>& names, const IntArray& kind, const Array& margin, const IntArray& vertex_count,
     const Array& vertices, const IntArray& face_count, const IntArray& faces, bool has_ground, double ground_height,
-    double ground_margin, double thickness, const std::vector<std::string>& cloth_names, const Array& cloth_margin,
-    const Array& cloth_poisson, const IntArray& node_count, const IntArray& triangle_count, const IntArray& triangles,
-    const Array& node_rest, const Array& warp, const MaskArray& pinned) {
+    std::optional<double> ground_margin, const Array& thickness, const std::vector<std::string>& cloth_names,
+    const Array& cloth_margin, const Array& cloth_poisson, const IntArray& node_count, const IntArray& triangle_count,
+    const IntArray& triangles, const Array& node_rest, const Array& warp, const MaskArray& pinned) {
     const py::ssize_t count = static_cast<py::ssize_t>(names.size());
     if (kind.size() != count || margin.size() != count || vertex_count.size() != count || face_count.size() != count)
         throw std::invalid_argument("Model: kind, margin, vertex_count and face_count must have one entry per name");
-    if (!(thickness > 0.0)) throw std::invalid_argument("Model: thickness must be positive");
+    if (thickness.ndim() != 1 || thickness.size() != count + static_cast<py::ssize_t>(cloth_names.size()))
+        throw std::invalid_argument("Model: thickness must have one entry per name and cloth name");
     auto model = std::make_shared<Model>();
-    model->thickness = thickness;
+    model->thickness = kInfinity;
+    for (py::ssize_t i = 0; i < thickness.size(); ++i) {
+        if (!(thickness.at(i) > 0.0)) throw std::invalid_argument("Model: thickness must be positive");
+        model->object_thickness.push_back(thickness.at(i));
+        model->thickness = std::min(model->thickness, thickness.at(i));
+    }
     model->ground = {has_ground, ground_height, ground_margin};
     py::ssize_t first_vertex = 0, first_face = 0;
     for (py::ssize_t i = 0; i < count; ++i) {
@@ -181,8 +189,8 @@ void bind_model(py::module_& module) {
             py::init(&make_model), py::kw_only(), py::arg("names"), py::arg("kind").noconvert(),
             py::arg("margin").noconvert(), py::arg("vertex_count").noconvert(), py::arg("vertices").noconvert(),
             py::arg("face_count").noconvert(), py::arg("faces").noconvert(), py::arg("has_ground"),
-            py::arg("ground_height"), py::arg("ground_margin"), py::arg("thickness"), py::arg("cloth_names"),
-            py::arg("cloth_margin").noconvert(), py::arg("cloth_poisson").noconvert(),
+            py::arg("ground_height"), py::arg("ground_margin"), py::arg("thickness").noconvert(),
+            py::arg("cloth_names"), py::arg("cloth_margin").noconvert(), py::arg("cloth_poisson").noconvert(),
             py::arg("node_count").noconvert(), py::arg("triangle_count").noconvert(), py::arg("triangles").noconvert(),
             py::arg("node_rest").noconvert(), py::arg("warp").noconvert(), py::arg("pinned").noconvert())
         .def_property_readonly("names", &object_names)

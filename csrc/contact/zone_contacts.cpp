@@ -9,7 +9,7 @@
 namespace diffsim {
 namespace {
 
-constexpr double kRoom = 0.05;     // of the thickness: room on all sides of a body at rest
+constexpr double kRoom = 0.05;     // of its thickness: room on all sides of a body at rest
 constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
 
@@ -97,7 +97,7 @@ void join_passive(
 }  // namespace
 
 double contact_margins(const Model& model, const Contact& contact) {
-    const double margins = model.margin(contact.object_a) + model.margin(contact.object_b);
+    const double margins = model.margin_sum(contact.object_a, contact.object_b);
     if (contact.object_a != contact.object_b) return margins;
     const Cloth& cloth = model.cloth_of(contact.object_a);
     const Surface rest{&cloth.surface, nullptr, cloth.rest.data()};
@@ -122,7 +122,8 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
     entry.cloth_a = a.cloth;
     entry.cloth_b = b.cloth;
     entry.pair = -1;
-    entry.range = contact_range(contact_margins(*zone.model, contact), zone.model->thickness);
+    entry.range = contact_range(
+        contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
     const double mass_a = a.cloth >= 0 ? feature_mass(zone, entry, true) : zone.bodies[a.body].mass;
     const double mass_b = b.cloth >= 0        ? feature_mass(zone, entry, false)
                           : b.body == kGround ? kInfinity
@@ -199,7 +200,8 @@ private:
         const Vec6 change = m_end.bodies[i] - m_begin.bodies[i];
         const double radius = m_zone.mesh(i).radius;
         const bool yields = i < m_zone.dynamic_count;
-        const double slack = yields ? kRoom * m_zone.model->thickness + kSidestep * motion_bound(change, radius) : 0.0;
+        const double room = kRoom * m_zone.model->own_thickness(id(i));
+        const double slack = yields ? room + kSidestep * motion_bound(change, radius) : 0.0;
         if (yields) m_coverage.slack.push_back(slack);
         m_meshes.push_back(swept_mesh(m_zone, i, m_begin, m_end, slack + sagitta(change, radius)));
         m_boxes.push_back(swept_box(m_meshes.back()));
@@ -214,7 +216,8 @@ private:
         const double uneven = std::max(
             uneven_motion(cloth, model.node_count(), m_begin, m_end),
             kWholeMotion * uneven_motion(cloth, model.node_count(), start, m_end));
-        const double slack = 0.5 * m_zone.model->thickness + 0.25 * uneven;
+        const double thickness = m_zone.model->own_thickness(m_zone.model->body_count() + cloth.id);
+        const double slack = 0.5 * thickness + 0.25 * uneven;
         m_coverage.cloth_slack.push_back(slack);
         m_cloths.push_back(sweep_cloth(m_zone, c, m_begin, m_end, Vec3::Zero(), model.margin + slack));
         return m_cloths.back().mesh(model, model.margin + slack);
@@ -224,7 +227,7 @@ private:
         for (int i = 0; i < static_cast<int>(m_meshes.size()); ++i) {
             if (!yields(i)) continue;
             m_vertices.clear();
-            collect_vertices_below(m_meshes[i], m_zone.ground_height + m_zone.model->ground.margin, m_vertices);
+            collect_vertices_below(m_meshes[i], m_zone.ground_height + m_zone.model->ground_margin(id(i)), m_vertices);
             for (int v : m_vertices)
                 add_contact(m_zone, {id(i), kGround, ContactType::vertex_patch, v, -1}, object(i), {kGround, -1});
         }

@@ -24,8 +24,8 @@ struct Body {
 /// The half-space z >= height.
 struct Ground {
     bool present = false;
-    double height = 0.0;  ///< [m]
-    double margin = 0.0;  ///< [m]
+    double height = 0.0;           ///< [m]
+    std::optional<double> margin;  ///< none: half the thickness of what meets it [m]
 };
 
 /// Stands for the ground where an object index is expected.
@@ -37,7 +37,8 @@ struct Model {
     std::vector<Body> bodies;
     std::vector<Cloth> cloths;
     Ground ground;
-    double thickness = 0.0;  ///< distance kept between surfaces of default margin [m]
+    double thickness = 0.0;  ///< distance kept between surfaces of default margin; of several, the smallest [m]
+    std::vector<double> object_thickness;  ///< the same of each object; empty: all have `thickness` [m]
 
     int body_count() const { return static_cast<int>(bodies.size()); }
     int cloth_count() const { return static_cast<int>(cloths.size()); }
@@ -46,8 +47,16 @@ struct Model {
     // Objects are the bodies, then the cloths, or kGround.
     bool is_cloth(int object) const { return object >= body_count(); }
     const Cloth& cloth_of(int object) const { return cloths[object - body_count()]; }
-    double margin(int object) const {
-        return object == kGround ? ground.margin : is_cloth(object) ? cloth_of(object).margin : bodies[object].margin;
+    double margin(int object) const { return is_cloth(object) ? cloth_of(object).margin : bodies[object].margin; }
+    double own_thickness(int object) const {
+        return object_thickness.empty() ? thickness : object_thickness[static_cast<std::size_t>(object)];
+    }
+    /// Distance of the ground's collision surface from its height, for an object that meets it [m].
+    double ground_margin(int object) const { return ground.margin.value_or(0.5 * own_thickness(object)); }
+    // Of a pair; `b` may be the ground, which has no size and so takes the other's thickness.
+    double margin_sum(int a, int b) const { return margin(a) + (b == kGround ? ground_margin(a) : margin(b)); }
+    double pair_thickness(int a, int b) const {
+        return b == kGround ? own_thickness(a) : 0.5 * (own_thickness(a) + own_thickness(b));
     }
     const std::string& name(int object) const;
 };

@@ -292,8 +292,9 @@ private:
                 m.groups.space(m.dynamic[k]) = space_of_body(m_model, m.bodies[m.dynamic[k]]);
         });
         for (int c = 0; c < m_model.cloth_count(); ++c) {
-            m.groups.space(m_model.body_count() + c) =
-                space_of_cloth(m_model.cloths[c], m_state, m_control, m_parameters, m_model.thickness, m_options.dt);
+            const int object = m_model.body_count() + c;
+            m.groups.space(object) = space_of_cloth(
+                m_model.cloths[c], m_state, m_control, m_parameters, m_model.own_thickness(object), m_options.dt);
         }
         if (m_options.global_zone)
             m.groups.unite_all();
@@ -302,7 +303,8 @@ private:
     }
 
     bool meets_ground(int i) const {
-        return m_model.ground.present && m.groups.space(i).lower.z() <= m_model.ground.height + m_model.ground.margin;
+        return m_model.ground.present &&
+               m.groups.space(i).lower.z() <= m_model.ground.height + m_model.ground_margin(i);
     }
 
     bool meets_passive(int i, std::vector<int>& near) const {

@@ -58,7 +58,7 @@ void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& 
 Box space_of_body(const Model& model, const ZoneBody& body) {
     const CollisionMesh& mesh = model.bodies[body.id].mesh;
     const double arc = std::max(sagitta(body.target, mesh.radius), sagitta(body.warm, mesh.radius));
-    const double reach = model.bodies[body.id].margin + 0.5 * model.thickness + arc;
+    const double reach = model.bodies[body.id].margin + 0.5 * model.own_thickness(body.id) + arc;
     Box box = swept_box({&mesh, {pose_at(body, body.warm), pose_at(body, body.target)}, reach});
     Box start = transformed(mesh.tree.nodes[0].box, body.start);
     start.inflate(reach);

@@ -33,7 +33,7 @@ inline Vec3 free_node_velocity(
 Box space_of_body(const Model& model, const ZoneBody& body);
 /// For a body that moves as told, by `motion`.
 Box space_of_driven_body(const Model& model, int id, const Pose& start, const Vec6& motion);
-/// For the nodes of a cloth. `thickness` is the model's.
+/// For the nodes of a cloth. `thickness` is its own.
 Box space_of_cloth(
     const Cloth& cloth, const SceneState& state, const SceneControl& control, const Parameters& parameters,
     double thickness, double dt);

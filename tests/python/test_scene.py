@@ -120,21 +120,46 @@ def test_orientation_is_normalised() -> None:
     np.testing.assert_allclose(to_matrix(one_body(orientation=(2, 0, 0, 2)).orientation[0])[0], [0, -1, 0], atol=1e-15)
 
 
-def test_default_thickness_is_a_thousandth_of_the_smallest_extent() -> None:
+def test_default_thickness_of_an_object_is_a_thousandth_of_its_smallest_extent() -> None:
     assert one_body().thickness == pytest.approx(1e-3)
     assert one_body(mesh=shapes.box((2.0, 0.05, 1.0))).thickness == pytest.approx(5e-5)
     assert one_body(mesh=shapes.box((2.0, 0.05, 1.0)), margin=0.1).thickness == pytest.approx(2.5e-4)
     scene = Scene()
+    scene.add_ground()
     scene.add_body(CUBE, density=1.0)
     scene.add_sphere(0.1, density=1.0, position=(2.0, 0.0, 0.0))
-    assert scene.pack().thickness == pytest.approx(2e-4)
     scene.add_capsule(0.05, 3.0, density=1.0, position=(4.0, 0.0, 0.0))
-    assert scene.pack().thickness == pytest.approx(1e-4)
+    scene.add_cloth(shapes.sheet((2.0, 0.5), 3), position=(0.0, 0.0, 2.0))
+    packed = scene.pack()
+    np.testing.assert_allclose(packed.object_thickness, [1e-3, 2e-4, 1e-4, 5e-4], rtol=1e-12)
+    np.testing.assert_allclose(packed.margin, [5e-4, 0.1, 0.05], rtol=1e-12)
+    np.testing.assert_allclose(packed.cloth_margin, [2.5e-4], rtol=1e-12)
+    assert packed.thickness == packed.object_thickness.max()
+    assert packed.ground_margin is None  # half of that of what meets it
+    packed = scene.pack(thickness=2e-3)
+    assert packed.object_thickness.tolist() == [2e-3] * 4
+    assert packed.ground_margin == 1e-3
 
 
-def test_flat_static_mesh_does_not_make_the_thickness_zero() -> None:
-    flat = (np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0]]), np.array([[0, 1, 2]]))
+@pytest.mark.parametrize("noise", [0.0, 1e-10, 1e-8, 1e-5, 1e-2])
+def test_thickness_of_a_flat_static_mesh_does_not_follow_its_noise(noise: float) -> None:
+    flat = (np.array([[0.0, 0, 0], [4, 0, 0], [4, 2, noise], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     assert one_body(mesh=flat, kind="static").thickness == pytest.approx(2e-3)
+
+
+def test_thickness_of_a_closed_mesh_that_is_flat_up_to_rounding_is_not_that_rounding() -> None:
+    slab = shapes.box((4.0, 2.0, 1e-7))
+    assert one_body(mesh=slab, kind="static").thickness == pytest.approx(2e-3)
+    card = shapes.box((4.0, 2.0, 1e-4))
+    assert one_body(mesh=card, kind="static").thickness == pytest.approx(1e-7)
+
+
+def test_a_landscape_is_not_thicker_than_what_moves_over_it() -> None:
+    scene = Scene()
+    scene.add_body(shapes.box(100.0), kind="static")
+    scene.add_body(CUBE, density=1.0, position=(0.0, 0.0, 51.0))
+    scene.add_sphere(0.05, density=1.0, position=(3.0, 0.0, 51.0))
+    np.testing.assert_allclose(scene.pack().object_thickness, [1e-3, 1e-3, 1e-4], rtol=1e-12)
 
 
 # ---- Handles ----------------------------------------------------------------------------------------------------
