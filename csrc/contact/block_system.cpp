@@ -57,6 +57,15 @@ void BlockSystem::set_zero() {
     for (Mat63& block : m_mixed_pairs) block.setZero();
 }
 
+void BlockSystem::copy_values(const BlockSystem& other) {
+    // Copied into what is there: the sparse factor points to the blocks.
+    std::copy(other.m_diagonal.begin(), other.m_diagonal.end(), m_diagonal.begin());
+    std::copy(other.m_off_diagonal.begin(), other.m_off_diagonal.end(), m_off_diagonal.begin());
+    std::copy(other.m_node_diagonal.begin(), other.m_node_diagonal.end(), m_node_diagonal.begin());
+    std::copy(other.m_node_pairs.begin(), other.m_node_pairs.end(), m_node_pairs.begin());
+    std::copy(other.m_mixed_pairs.begin(), other.m_mixed_pairs.end(), m_mixed_pairs.begin());
+}
+
 int BlockSystem::find_node_pair(int i, int j) const { return find_pair(m_pattern.node_pairs, m_node_first, i, j); }
 
 int BlockSystem::find_mixed_pair(int body, int node) const {

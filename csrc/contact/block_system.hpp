@@ -43,6 +43,8 @@ public:
     const BlockPattern& pattern() const { return m_pattern; }
 
     void set_zero();
+    /// Take over the blocks of another system with the same pattern.
+    void copy_values(const BlockSystem& other);
     Mat6& diagonal(int body) { return m_diagonal[body]; }
     const Mat6& diagonal(int body) const { return m_diagonal[body]; }
     /// Block (i, j) of body pair number `pair`.

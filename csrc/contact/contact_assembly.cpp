@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 
 #include "math/positive_part.hpp"
 
@@ -28,14 +29,27 @@ public:
           m_system(system) {}
 
     void run() {
-        for (const ActiveContact& active : m_point.active) add(active);
+        for (const ActiveContact& active : m_point.active) add(active.index, active.geometry);
+        end();
+    }
+
+    /// Contacts that push with forces of their own, instead of the active ones.
+    void run(const std::vector<PushingContact>& pushing) {
+        for (const PushingContact& contact : pushing) {
+            m_own_force = contact.force;
+            add(contact.index, *contact.geometry);
+        }
+        end();
+    }
+
+private:
+    void end() {
         end_bodies();
         end_ground();
         m_derivatives.largest_force = std::max(m_derivatives.largest_force, std::sqrt(m_force_sq));
         m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, std::sqrt(m_stiffness_sq));
     }
 
-private:
     /// Where the derivatives of a contact's side go.
     struct BodyPlace {
         int body;
@@ -46,27 +60,28 @@ private:
         ClothSide side;
     };
 
-    void add(const ActiveContact& active) {
-        const ZoneContact& contact = m_zone.contacts[active.index];
+    void add(int index, const ContactGeometry& geometry) {
+        const ZoneContact& contact = m_zone.contacts[index];
         if (contact.contact.with_ground()) {
             if (contact.cloth_a >= 0)
-                add_node_on_ground(contact, active);
+                add_node_on_ground(contact, geometry);
             else
-                add_body_on_ground(contact, active);
+                add_body_on_ground(contact, geometry);
         } else if (contact.cloth_a >= 0) {
-            add_pair(contact, active, cloth_on(contact, active, true), cloth_on(contact, active, false));
+            add_pair(contact, geometry, cloth_on(contact, geometry, true), cloth_on(contact, geometry, false));
         } else if (contact.cloth_b >= 0) {
             add_pair(
-                contact, active, BodyPlace{contact.a, {m_point.poses[contact.a].t}}, cloth_on(contact, active, false));
+                contact, geometry, BodyPlace{contact.a, {m_point.poses[contact.a].t}},
+                cloth_on(contact, geometry, false));
         } else {
-            add_bodies(contact, active);
+            add_bodies(contact, geometry);
         }
     }
 
-    ClothPlace cloth_on(const ZoneContact& contact, const ActiveContact& active, bool of_a) const {
+    ClothPlace cloth_on(const ZoneContact& contact, const ContactGeometry& geometry, bool of_a) const {
         const Surface surface = of_a ? surface_a(m_zone, contact, m_point.poses, m_point.nodes)
                                      : surface_b(m_zone, contact, m_point.poses, m_point.nodes);
-        return {feature_nodes(m_zone, contact, of_a), cloth_side(contact.contact, active.geometry, surface, of_a)};
+        return {feature_nodes(m_zone, contact, of_a), cloth_side(contact.contact, geometry, surface, of_a)};
     }
 
     void note_scale(double scale_sq, double force, double stiffness) {
@@ -77,11 +92,13 @@ private:
     // --- two bodies --------------------------------------------------------------------------------------------
 
     /// Contacts of the same two bodies follow each other. They are added up along the bodies' relative motion.
-    void add_bodies(const ZoneContact& contact, const ActiveContact& active) {
+    void add_bodies(const ZoneContact& contact, const ContactGeometry& geometry) {
         if (contact.a != m_a || contact.b != m_b) begin_bodies(contact);
-        const ContactForce<9> d = add_relative_derivatives(
-            active.geometry, contact.range, contact.stiffness.value, BodySide{m_point.poses[m_a].t},
-            BodySide{m_point.poses[m_b].t}, m_with_curvature, m_system != nullptr ? &m_hessian : nullptr);
+        const BodySide a{m_point.poses[m_a].t}, b{m_point.poses[m_b].t};
+        const ContactForce<9> d = m_own_force ? add_relative_curvature(geometry, *m_own_force, a, b, m_hessian)
+                                              : add_relative_derivatives(
+                                                    geometry, contact.range, contact.stiffness.value, a, b,
+                                                    m_with_curvature, m_system != nullptr ? &m_hessian : nullptr);
         m_gradient += d.gradient;
         const Vec3 shift = d.row.tail<3>();
         if (m_zone.yields(m_a))
@@ -167,11 +184,12 @@ private:
     }
 
     template <class A>
-    void add_pair(const ZoneContact& contact, const ActiveContact& active, const A& a, const ClothPlace& b) {
+    void add_pair(const ZoneContact& contact, const ContactGeometry& geometry, const A& a, const ClothPlace& b) {
         constexpr int kA = decltype(a.side)::kSize, kB = ClothSide::kSize;
-        ContactDerivatives<kA + kB> d = contact_derivatives(
-            active.geometry, contact.range, contact.stiffness.value, a.side, b.side, m_system != nullptr,
-            m_with_curvature);
+        ContactDerivatives<kA + kB> d = m_own_force ? contact_curvature(geometry, *m_own_force, a.side, b.side)
+                                                    : contact_derivatives(
+                                                          geometry, contact.range, contact.stiffness.value, a.side,
+                                                          b.side, m_system != nullptr, m_with_curvature);
         if (yields(a)) add_gradient(a, d.row.template head<kA>(), d.gradient.template head<kA>(), d.force, d.stiffness);
         add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
         if (m_system == nullptr) return;
@@ -189,15 +207,16 @@ private:
 
     // --- ground ------------------------------------------------------------------------------------------------
 
-    void add_body_on_ground(const ZoneContact& contact, const ActiveContact& active) {
+    void add_body_on_ground(const ZoneContact& contact, const ContactGeometry& geometry) {
         if (contact.a != m_on_ground) {
             end_ground();
             m_on_ground = contact.a;
             m_ground = {};
             m_ground_stiffness = &contact.stiffness;
         }
-        const Vec3 arm = active.geometry.closest.point_a - m_point.poses[contact.a].t;
-        const PotentialValue d = m_ground.add(active.geometry.distance, arm, contact.range, contact.stiffness.value);
+        const Vec3 arm = geometry.closest.point_a - m_point.poses[contact.a].t;
+        if (m_own_force) return m_ground.add_force(*m_own_force, arm);
+        const PotentialValue d = m_ground.add(geometry.distance, arm, contact.range, contact.stiffness.value);
         const ZoneBody& body = m_zone.bodies[contact.a];
         const Vec3 turn = GroundContacts::row(arm).head<3>();
         note_scale(turn.dot(body.inverse_inertia * turn) + 1.0 / body.mass, d.force, d.stiffness);
@@ -217,12 +236,12 @@ private:
         m_on_ground = kNobody;
     }
 
-    void add_node_on_ground(const ZoneContact& contact, const ActiveContact& active) {
+    void add_node_on_ground(const ZoneContact& contact, const ContactGeometry& geometry) {
+        if (m_own_force) return;  // it has no curvature
         const int node = feature_nodes(m_zone, contact, true)[0];
         if (m_zone.nodes[node].pinned) return;
         const PotentialValue potential = contact_potential(
-            contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
-            contact.stiffness.value);
+            contact.range.rest - geometry.distance, contact.range.rest - contact.range.pole, contact.stiffness.value);
         m_derivatives.gradient.nodes[node].z() -= potential.force;
         note_scale(1.0 / m_zone.nodes[node].mass, potential.force, potential.stiffness);
         if (m_system != nullptr) m_system->node_diagonal(node)(2, 2) += potential.stiffness;
@@ -234,6 +253,7 @@ private:
     CutShare m_cut;
     ZoneDerivatives& m_derivatives;
     BlockSystem* m_system;
+    std::optional<double> m_own_force;              // of the contact at hand
     double m_force_sq = 0.0, m_stiffness_sq = 0.0;  // largest so far
     int m_a = kNobody, m_b = kNobody, m_pair = -1;  // the two bodies at hand
     Vector<9> m_gradient;
@@ -250,6 +270,12 @@ void add_contact_derivatives(
     const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives,
     BlockSystem* system) {
     Assembler(zone, point, curvature, cut, derivatives, system).run();
+}
+
+void add_contact_curvature(
+    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
+    ZoneDerivatives& derivatives, BlockSystem& system) {
+    Assembler(zone, point, Curvature::full, cut, derivatives, &system).run(pushing);
 }
 
 }  // namespace diffsim

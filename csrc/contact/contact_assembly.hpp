@@ -12,4 +12,9 @@ void add_contact_derivatives(
     const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives,
     BlockSystem* system);
 
+/// The same of contacts that push with these forces, whatever their distances: -force d²(distance), and no stiffness.
+void add_contact_curvature(
+    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
+    ZoneDerivatives& derivatives, BlockSystem& system);
+
 }  // namespace diffsim

@@ -351,6 +351,19 @@ ContactForce<A::kSize + B::kSize> derivatives_along(
     return result;
 }
 
+template <class A, class B>
+ContactForce<A::kSize + B::kSize> curvature_along(
+    const ContactGeometry& geometry, double force, const A& a, const B& b,
+    HalfSymmetric<A::kSize + B::kSize>& hessian) {
+    ContactForce<A::kSize + B::kSize> result;
+    result.row = relative_row(a, b, geometry.normal);
+    result.force = force;
+    result.stiffness = 0.0;
+    result.gradient = -force * result.row;
+    add_distance_hessian(geometry, a, b, -force, hessian);
+    return result;
+}
+
 // Where the turns and shifts of a and of b come from, and with which sign: a shift of a is the opposite shift of b.
 constexpr std::array<int, 4> kRelativeFrom = {0, 6, 3, 6};
 constexpr std::array<double, 4> kRelativeSign = {1.0, -1.0, 1.0, 1.0};
@@ -363,6 +376,24 @@ ContactForce<9> add_relative_derivatives(
     return derivatives_along(
         geometry, range, stiffness, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b),
         with_curvature, hessian);
+}
+
+ContactForce<9> add_relative_curvature(
+    const ContactGeometry& geometry, double force, const BodySide& a, const BodySide& b, HalfSymmetric<9>& hessian) {
+    return curvature_along(
+        geometry, force, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b), hessian);
+}
+
+template <class A, class B>
+ContactDerivatives<A::kSize + B::kSize> contact_curvature(
+    const ContactGeometry& geometry, double force, const A& side_a, const B& side_b) {
+    HalfSymmetric<A::kSize + B::kSize> hessian;
+    ContactDerivatives<A::kSize + B::kSize> result;
+    static_cast<ContactForce<A::kSize + B::kSize>&>(result) = curvature_along(
+        geometry, force, motion_of(side_a, geometry.closest.point_a), motion_of(side_b, geometry.closest.point_b),
+        hessian);
+    result.hessian = hessian.whole();
+    return result;
 }
 
 Vector<12> both_twists(const Vector<9>& relative) {
@@ -452,5 +483,7 @@ DIFFSIM_INSTANTIATE(BodySide, BodySide)
 DIFFSIM_INSTANTIATE(BodySide, ClothSide)
 DIFFSIM_INSTANTIATE(ClothSide, ClothSide)
 #undef DIFFSIM_INSTANTIATE
+template ContactDerivatives<15> contact_curvature(const ContactGeometry&, double, const BodySide&, const ClothSide&);
+template ContactDerivatives<18> contact_curvature(const ContactGeometry&, double, const ClothSide&, const ClothSide&);
 
 }  // namespace diffsim

@@ -63,6 +63,14 @@ ContactForce<9> add_relative_derivatives(
     const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
     bool with_curvature, HalfSymmetric<9>* hessian);
 
+/// The same for a contact that pushes with a force of its own, whatever its distance, as a row of a ContactModel does: the second
+/// derivative is -force d²(distance).
+ContactForce<9> add_relative_curvature(
+    const ContactGeometry& geometry, double force, const BodySide& a, const BodySide& b, HalfSymmetric<9>& hessian);
+template <class A, class B>
+ContactDerivatives<A::kSize + B::kSize> contact_curvature(
+    const ContactGeometry& geometry, double force, const A& a, const B& b);
+
 /// From there to the twists of a and of b.
 Vector<12> both_twists(const Vector<9>& relative);
 Square<12> both_twists(const Square<9>& relative);
@@ -74,6 +82,12 @@ public:
     static Vec6 row(const Vec3& arm);
     /// One more vertex. Returns its energy with respect to its compression.
     PotentialValue add(double height, const Vec3& arm, const ContactRange& range, double stiffness);
+
+    /// One that pushes with a force of its own.
+    void add_force(double force, const Vec3& arm) {
+        m_force += force;
+        m_force_arm += force * arm;
+    }
 
     Vec6 gradient() const;
     Mat6 hessian(bool with_curvature) const;

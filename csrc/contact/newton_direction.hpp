@@ -1,5 +1,6 @@
 #pragma once
 
+#include "contact/cut_search.hpp"
 #include "contact/zone.hpp"
 
 namespace diffsim {
@@ -15,6 +16,10 @@ public:
     bool repeat(
         const Zone& zone, const ZoneDerivatives& derivatives, const BlockSystem& system, Coordinates& step) const;
 
+    /// After compute(), where bodies' exact Hessian was not positive definite: a direction of negative curvature that does not
+    /// lead up. False if none was found.
+    bool off_saddle(const Zone& zone, const ZoneDerivatives& derivatives, const BlockSystem& system, Coordinates& step);
+
     bool has_factor() const { return m_has_factor; }
     /// Whether it is that of the exact Hessian.
     bool is_exact() const { return m_is_exact; }
@@ -26,9 +31,8 @@ private:
     bool factorize_with_cloth(
         const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system);
 
-    CutShare m_cut = kNothingCut;  // of the next step
-    int m_dropped = 0;             // steps of bodies without curvature so far
-    bool m_try_exact = true;       // in the next step
+    CutSearch m_cut;
+    BlockSystem m_exact;  // the Hessian that was not positive definite
     bool m_has_factor = false;
     bool m_is_exact = false;
 };

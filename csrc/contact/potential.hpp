@@ -49,7 +49,7 @@ ContactStiffness contact_stiffness(double mass_a, double mass_b, double complian
 /// The distances at which things happen between two surfaces with this sum of margins.
 struct ContactRange {
     double rest;     ///< contact pushes below this [m]
-    double landing;  ///< what linearised impacts of cloth aim at: inside the contact's reach, far from its pole [m]
+    double landing;  ///< where last step's motion is stopped: inside the contact's reach, far from its pole [m]
     double floor;    ///< motions are stopped here [m]
     double pole;     ///< the energy is infinite here [m]
     double limit;    ///< objects this near penetrate [m]

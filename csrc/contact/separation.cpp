@@ -3,7 +3,7 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 
-#include "contact/zone_contacts.hpp"
+#include "contact/contact_model.hpp"
 
 namespace diffsim {
 namespace {
@@ -73,12 +73,11 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
     std::vector<Mat3> inertia_body(count);
     for (std::size_t i = 0; i < count; ++i)
         inertia_body[i] = zone.bodies[i].start.R.transpose() * zone.bodies[i].inertia * zone.bodies[i].start.R;
-    // Moving apart is geometry: however different their masses, bodies share the way.
-    std::vector<double> mass_factor(count);
-    for (std::size_t i = 0; i < count; ++i) mass_factor[i] = 1.0 / zone.bodies[i].mass;
     Separation result;
     ZonePoint point;
-    BlockSystem system, cloth;
+    BlockSystem system;
+    ContactModel model;
+    ModelWorkspace workspace;
     ContactCoverage coverage;
     Coordinates zero;
     zero.assign_zero(count, node_count);
@@ -92,7 +91,7 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
         Placement at;
         at.y = begin;
         place(zone, at.y, at.poses, at.nodes);
-        std::vector<ImpactRow> rows;
+        model.rows.clear();
         std::vector<int> row_contacts;
         bool complete = true;
         result.lack = 0.0;
@@ -113,22 +112,26 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
             if (!gap.valid) continue;
             geometry.normal = gap.normal;
             geometry.distance = gap.gap;
-            rows.push_back(make_row(zone, contact, geometry, at, begin, contact.range.rest + kClearance * depth));
+            model.rows.push_back(make_row(zone, contact, geometry, at, begin, contact.range.rest + kClearance * depth));
+            model.rows.back().range = depth;
             row_contacts.push_back(static_cast<int>(k));
         }
         result.complete = complete;
         if (complete) break;
         system.set_pattern(base_pattern(zone));
         ensure_pattern(zone, row_contacts, system);
-        if (node_count > 0) {
-            BlockPattern pattern;
-            pattern.node_count = zone.node_count();
-            cloth.set_pattern(pattern);
-            for (int i = 0; i < zone.node_count(); ++i)
-                cloth.node_diagonal(i) = (zone.nodes[i].pinned ? 1.0 : zone.nodes[i].mass) * Mat3::Identity();
+        model.smooth.set_pattern(system.pattern());
+        model.smooth.set_zero();
+        // Moving apart is geometry: however different their masses, bodies share the way.
+        for (int i = 0; i < zone.dynamic_count; ++i) {
+            model.smooth.diagonal(i).topLeftCorner<3, 3>() = zone.bodies[i].inertia / zone.bodies[i].mass;
+            model.smooth.diagonal(i).diagonal().tail<3>().setOnes();
         }
+        for (int i = 0; i < zone.node_count(); ++i)
+            model.smooth.node_diagonal(i) = (zone.nodes[i].pinned ? 1.0 : zone.nodes[i].mass) * Mat3::Identity();
+        model.gradient = zero;
         Coordinates p = zero;
-        solve_impact_qp(zone, zero, mass_factor, node_count > 0 ? &cloth : nullptr, rows, system, p);
+        minimise(model, 1.0, 0.0, system, workspace, p);
         for (std::size_t i = 0; i < count; ++i) {
             ZoneBody& body = zone.bodies[i];
             body.start = pose_at(body, p.bodies[i]);

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "contact/impact_qp.hpp"
+#include "contact/zone_contacts.hpp"
 
 namespace diffsim {
 

@@ -378,27 +378,23 @@ void add_elastic_hessian(const Zone& zone, const ZonePoint& point, CutShare cut,
     }
 }
 
-void differentiate(
+namespace {
+
+void set_zero(const Zone& zone, ZoneDerivatives& derivatives) {
+    const std::size_t count = static_cast<std::size_t>(zone.dynamic_count);
+    derivatives.gradient.assign_zero(count, zone.nodes.size());
+    derivatives.torque.resize(count);
+    derivatives.jacobian.resize(count);
+    derivatives.body_contacts.clear();
+    derivatives.largest_force = derivatives.largest_stiffness = 0.0;
+}
+
+/// What contacts do to bodies, from twists to coordinates, and inertia and elasticity.
+void end_differentiation(
     const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
     CutShare cut) {
     const int count = zone.dynamic_count;
-    derivatives.gradient.assign_zero(static_cast<std::size_t>(count), zone.nodes.size());
-    derivatives.torque.resize(static_cast<std::size_t>(count));
-    derivatives.jacobian.resize(static_cast<std::size_t>(count));
-    derivatives.body_contacts.clear();
-    derivatives.largest_force = derivatives.largest_stiffness = 0.0;
-    if (curvature == Curvature::none) system = nullptr;
-    if (system != nullptr) {
-        if (!zone.nodes.empty()) {
-            std::vector<int> indices;
-            for (const ActiveContact& active : point.active) indices.push_back(active.index);
-            ensure_pattern(zone, indices, *system);
-        }
-        system->set_zero();
-    }
-    add_contact_derivatives(zone, point, curvature, cut, derivatives, system);
-
-    // From twists to coordinates. Bodies that have not turned and carry no torque need no change of chart.
+    // Bodies that have not turned and carry no torque need no change of chart.
     for (int i = 0; i < count; ++i) {
         const ZoneBody& body = zone.bodies[i];
         const Vec6& y = point.y.bodies[i];
@@ -442,6 +438,34 @@ void differentiate(
         Mat63& block = system->mixed_pair(k);
         block.topRows<3>() = derivatives.jacobian[pattern.mixed_pairs[k].first].transpose() * block.topRows<3>().eval();
     }
+}
+
+}  // namespace
+
+void differentiate(
+    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
+    CutShare cut) {
+    set_zero(zone, derivatives);
+    if (curvature == Curvature::none) system = nullptr;
+    if (system != nullptr) {
+        if (!zone.nodes.empty()) {
+            std::vector<int> indices;
+            for (const ActiveContact& active : point.active) indices.push_back(active.index);
+            ensure_pattern(zone, indices, *system);
+        }
+        system->set_zero();
+    }
+    add_contact_derivatives(zone, point, curvature, cut, derivatives, system);
+    end_differentiation(zone, point, curvature, derivatives, system, cut);
+}
+
+void differentiate_smooth(
+    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
+    ZoneDerivatives& derivatives, BlockSystem& system) {
+    set_zero(zone, derivatives);
+    system.set_zero();
+    add_contact_curvature(zone, point, pushing, cut, derivatives, system);
+    end_differentiation(zone, point, Curvature::full, derivatives, &system, cut);
 }
 
 }  // namespace diffsim

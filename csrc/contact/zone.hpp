@@ -218,6 +218,19 @@ void differentiate(
     const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
     CutShare cut = kNothingCut);
 
+/// A contact with a force of its own, as a row of a ContactModel has it.
+struct PushingContact {
+    int index;  ///< into Zone::contacts
+    const ContactGeometry* geometry;
+    double force;  ///< [kg·m]
+};
+
+/// The Hessian of inertia and elasticity, and what contacts that push with these forces add to it by their curvature alone,
+/// so much of the negative curvature cut off. `system` has a pattern of these contacts.
+void differentiate_smooth(
+    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
+    ZoneDerivatives& derivatives, BlockSystem& system);
+
 /// Add a block to a system's rows of node i and columns of node j, once per pair. Pinned nodes have none.
 void add_node_block(const Zone& zone, int i, int j, const Mat3& block, BlockSystem& system);
 

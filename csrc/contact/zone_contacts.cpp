@@ -19,12 +19,9 @@ double sagitta(const Vec6& change, double radius) {
     return radius * std::min(0.125 * angle * angle, 2.0);
 }
 
-SweptMesh swept_mesh(const Zone& zone, int body, const Coordinates& begin, const Coordinates& end, double slack) {
+SweptMesh swept_mesh(const Zone& zone, int body, const Vec6& begin, const Vec6& end, double slack) {
     const ZoneBody& b = zone.bodies[body];
-    return {
-        &zone.mesh(body),
-        {pose_at(b, begin.bodies[body]), pose_at(b, end.bodies[body])},
-        zone.model->bodies[b.id].margin + slack};
+    return {&zone.mesh(body), {pose_at(b, begin), pose_at(b, end)}, zone.model->bodies[b.id].margin + slack};
 }
 
 /// A cloth between two places, in the zone's frame.
@@ -197,13 +194,16 @@ private:
     bool yields(int i) const { return i < m_zone.dynamic_count || i >= m_zone.body_count(); }
 
     void add_body(int i) {
-        const Vec6 change = m_end.bodies[i] - m_begin.bodies[i];
         const double radius = m_zone.mesh(i).radius;
         const bool yields = i < m_zone.dynamic_count;
-        const double room = kRoom * m_zone.model->own_thickness(id(i));
-        const double slack = yields ? room + kSidestep * motion_bound(change, radius) : 0.0;
+        // A driven body goes all its way sooner or later, whatever the way at hand.
+        const Vec6& end = yields ? m_end.bodies[i] : m_zone.bodies[i].target;
+        const Vec6 change = end - m_begin.bodies[i];
+        // Late ways are short, but they may turn: room in proportion to the step's whole motion, too.
+        const double motion = std::max(motion_bound(change, radius), motion_bound(end, radius));
+        const double slack = yields ? kRoom * m_zone.model->own_thickness(id(i)) + kSidestep * motion : 0.0;
         if (yields) m_coverage.slack.push_back(slack);
-        m_meshes.push_back(swept_mesh(m_zone, i, m_begin, m_end, slack + sagitta(change, radius)));
+        m_meshes.push_back(swept_mesh(m_zone, i, m_begin.bodies[i], end, slack + sagitta(change, radius)));
         m_boxes.push_back(swept_box(m_meshes.back()));
     }
 

@@ -7,14 +7,8 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxHalvings = 50;
-constexpr int kMaxListings = 8;               // for an impact direction that leads out of the list it was found with
 constexpr double kBeforeImpact = 1.0 - 1e-6;  // of the way to an impact: there rounding finds it once more
 constexpr double kArcPart = 0.9;              // of an arc whose chord is not clear
-constexpr double kMaxTurn = 0.5;              // [rad] of a body in an impact direction, to begin with
-constexpr double kLeastTurn = 1e-3;
-constexpr double kTurnFactor = 0.25;    // to less turn where less
-constexpr double kMostlyBlocked = 0.5;  // than this part of a direction is free, and back where more
-constexpr double kMostlyFree = 0.7;     // than this is
 
 }  // namespace
 
@@ -27,8 +21,7 @@ ZonePath::ZonePath(
       m_point(point),
       m_trial(trial),
       m_coverage(coverage),
-      m_system(system),
-      m_max_turn(kMaxTurn) {}
+      m_system(system) {}
 
 void ZonePath::set_to_targets(Coordinates& y_end) const {
     for (std::size_t i = 0; i < y_end.bodies.size(); ++i) y_end.bodies[i] = m_zone.bodies[i].target;
@@ -47,6 +40,7 @@ void ZonePath::list_contacts(Coordinates& y_end) {
     }
     for (const ZoneNode& node : m_zone.nodes) m_position = std::max(m_position, node.start.cwiseAbs().maxCoeff());
     m_system.set_pattern(base_pattern(m_zone));
+    ++m_list_number;
 }
 
 bool ZonePath::ensure_covered(Coordinates& y_end) {
@@ -66,6 +60,18 @@ int ZonePath::set_gates(const Coordinates& y_end) {
     m_gates = find_impact_gates(m_zone, m_point, y_end);
     return static_cast<int>(
         std::count_if(m_gates.begin(), m_gates.end(), [](const ImpactGate& gate) { return gate.fast; }));
+}
+
+bool ZonePath::is_fast(int body) const {
+    return std::any_of(
+        m_gates.begin(), m_gates.end(), [&](const ImpactGate& gate) { return gate.a == body || gate.b == body; });
+}
+
+bool ZonePath::is_fast(const ZoneContact& contact) const {
+    if (contact.contact.with_ground() || contact.cloth_a >= 0 || contact.cloth_b >= 0) return false;
+    return std::any_of(m_gates.begin(), m_gates.end(), [&](const ImpactGate& gate) {
+        return gate.fast && gate.a == contact.a && gate.b == contact.b;
+    });
 }
 
 void ZonePath::set_trial(const Coordinates& y_end, double step) {
@@ -107,33 +113,6 @@ double ZonePath::covered_step(Coordinates& y_end, double known) {
     const bool listed_anew = ensure_covered(y_end);
     if (!listed_anew && known == 1.0 && gates_hold(y_end)) return 1.0;
     return arc_step(y_end, 1.0);
-}
-
-ImpactDirection ZonePath::past_impacts() {
-    Coordinates target = m_point.y;
-    set_to_targets(target);
-    ensure_covered(target);
-    ImpactDirection direction = impact_direction(m_zone, m_point, m_max_turn, m_system);
-    for (int k = 0; k < kMaxListings && !covers(direction.y_end); ++k) {
-        list_contacts(direction.y_end);
-        evaluate(m_zone, m_point);
-        const int newton_steps = direction.newton_steps;
-        direction = impact_direction(m_zone, m_point, m_max_turn, m_system, &direction);
-        direction.newton_steps += newton_steps;
-    }
-    direction.y_end.bodies.resize(m_zone.bodies.size());
-    return direction;
-}
-
-/// Rows are straight and bodies turn: where they leave their rows so early that little of a direction is free, they should
-/// turn less in the next one, so that the others get on.
-double ZonePath::step_past_impacts(Coordinates& y_end, double known) {
-    const double step = covered_step(y_end, known);
-    if (step < kMostlyBlocked)
-        m_max_turn = std::max(kTurnFactor * m_max_turn, kLeastTurn);
-    else if (step > kMostlyFree)
-        m_max_turn = std::min(m_max_turn / kTurnFactor, kMaxTurn);
-    return step;
 }
 
 }  // namespace diffsim

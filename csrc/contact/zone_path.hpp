@@ -3,8 +3,8 @@
 #include <vector>
 
 #include "contact/hard_contacts.hpp"
-#include "contact/impact_direction.hpp"
 #include "contact/impact_gate.hpp"
+#include "contact/zone_contacts.hpp"
 
 namespace diffsim {
 
@@ -29,6 +29,8 @@ public:
     void list_contacts(Coordinates& y_end);
     /// Make the list complete for a step to y_end; true if it had to be made anew.
     bool ensure_covered(Coordinates& y_end);
+    /// How often contacts were listed: lists with the same number are the same.
+    int list_number() const { return m_list_number; }
     bool covers(const Coordinates& y_end) const { return is_covered(m_zone, m_coverage, y_end); }
     /// Some objects start the step below their floor: widen the range of their contacts, here and in all lists to come.
     void rescue();
@@ -37,6 +39,9 @@ public:
 
     /// Set those of the way to y_end. Returns how many are of fast bodies.
     int set_gates(const Coordinates& y_end);
+    /// Whether a body has a gate of fast bodies, and whether a contact is of two with one.
+    bool is_fast(int body) const;
+    bool is_fast(const ZoneContact& contact) const;
     bool gates_hold(const Coordinates& y) const { return diffsim::gates_hold(m_gates, m_zone, y); }
 
     // --- steps
@@ -51,11 +56,6 @@ public:
     /// The allowed step to y_end, with the list of contacts complete for it. `known`: how much is free for those listed.
     double covered_step(Coordinates& y_end, double known = 0.0);
 
-    /// Where the QP of all nearby contacts leads.
-    ImpactDirection past_impacts();
-    /// The same as covered_step for such a direction, from which the next one learns how far bodies should turn.
-    double step_past_impacts(Coordinates& y_end, double known);
-
 private:
     Zone& m_zone;
     const PassiveBodies& m_passive;
@@ -65,7 +65,7 @@ private:
     BlockSystem& m_system;
     std::vector<ImpactGate> m_gates;
     double m_position = 0.0;
-    double m_max_turn;  // [rad] of the next impact direction
+    int m_list_number = 0;
     bool m_rescue = false;
 };
 

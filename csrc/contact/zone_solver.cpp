@@ -5,9 +5,11 @@
 #include <utility>
 
 #include "contact/hard_contacts.hpp"
+#include "contact/model_direction.hpp"
 #include "contact/newton_direction.hpp"
 #include "contact/zone_accuracy.hpp"
 #include "contact/zone_path.hpp"
+#include "parallel/interrupt.hpp"
 
 namespace diffsim {
 namespace {
@@ -18,19 +20,14 @@ constexpr int kMaxStalls = 3;            // steps in a row that get a driven bod
 constexpr double kStall = 1e-3;          // of the way that is left
 constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
 constexpr int kMaxHardRounds = 50;
-constexpr int kRelaxations = 8;            // Newton steps after driven bodies were stopped, before they go on
-constexpr double kRelaxed = 1e-2;          // residual at which they may go on earlier
-constexpr double kFarFromBalance = 0.1;    // residual above which it matters most which contacts push,
-constexpr double kNearBalance = 0.03;      // and below which it no longer does
-constexpr double kGoodEnough = 1e3;        // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;          // without halving the residual: rounding's sign
-constexpr int kFutileSteps = 50;           // without a lower energy: there is none to be found
-constexpr int kMaxQpSteps = 6000;          // Newton steps of a cloth's impact QPs: from there on impacts just stop it,
-constexpr int kStepsWithoutQp = 1000;      // so many steps
-constexpr double kContraction = 0.1;       // of the residual: steps with an old factor that do less are not worth it
-constexpr double kHeld = 0.1;              // of the way to its target: a body that moved less is held by something
-constexpr double kShortWay = 0.1;          // of a body's radius
-constexpr double kClampedStep = 0.999999;  // a step this long was not stopped by CCD in any way that matters
+constexpr double kNearSolution = 1e-4;  // residual below which the plain Newton step ends it
+constexpr int kMaxModelFactors = 1000;  // of a zone with cloth: from there on impacts just stop it
+constexpr double kGoodEnough = 1e3;     // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;       // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;        // without a lower energy: there is none to be found
+constexpr double kContraction = 0.1;    // of the residual: steps with an old factor that do less are not worth it
+constexpr double kHeld = 0.1;           // of the way to its target: a body that moved less is held by something
+constexpr double kShortWay = 0.1;       // of a body's radius
 
 /// State of one solve; the steps of solve_zone as members.
 class ZoneSolver {
@@ -42,7 +39,8 @@ public:
           m_options(options),
           m_w(workspace),
           m_visited(visited),
-          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
+          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system),
+          m_model(zone, m_path, workspace.point, workspace.system) {}
 
     ZoneResult solve() {
         start();
@@ -80,6 +78,7 @@ private:
             return;
         }
         if (rescue) m_path.rescue();
+        m_model.start_from(m_w.point);
         m_visited.assign(count + m_zone.cloths.size(), Box());
         mark_visited();
     }
@@ -159,7 +158,18 @@ private:
 
     // --- Newton ------------------------------------------------------------------------------------------------
 
-    Accuracy current_accuracy() const { return accuracy(m_zone, m_w.derivatives, m_path.position()); }
+    /// Where nothing pushes, a contact within rounding of its rest distance may be found to push or not.
+    Accuracy current_accuracy() {
+        double& stiffness = m_w.derivatives.largest_stiffness;
+        for (std::size_t k = 0; m_w.point.active.empty() && k < m_zone.contacts.size(); ++k) {
+            const ZoneContact& contact = m_zone.contacts[k];
+            if (m_w.point.distances[k] > contact.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
+            for (int body : {contact.a, contact.b})
+                if (m_zone.yields(body))
+                    stiffness = std::max(stiffness, contact.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
+        }
+        return accuracy(m_zone, m_w.derivatives, m_path.position());
+    }
     double current_noise() { return energy_noise(m_zone, m_w.point, m_w.system, m_path.position(), m_w.pushed); }
 
     double slope(const Coordinates& gradient) const {
@@ -197,6 +207,7 @@ private:
             if (step < 1.0 && k > 0 && allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr) < 1.0) continue;
             evaluate(m_zone, m_w.trial, &m_w.point);
             const double change = m_w.trial.energy - m_w.point.energy;
+            m_newton_full = step == 1.0;
             if (change <= kArmijo * step * slope0) return true;
             if (change <= noise) {
                 differentiate(m_zone, m_w.trial, Curvature::none, m_w.trial_derivatives, nullptr);
@@ -246,19 +257,23 @@ private:
 
     void iterate() {
         int stalls = 0;
-        int relaxations = 0;  // Newton steps to be taken before driven bodies go on
         double best_residual = kInfinity;
         int stagnant = 0;  // steps since the residual last halved
-        int steps_without_qp = 0;
         double lowest_energy = kInfinity;
         int futile = 0;  // steps since it fell by more than rounding may do
         for (;; ++m_result.iterations) {
+            if (m_options.interrupt != nullptr) m_options.interrupt->throw_if_asked();
             const bool driven = drives_done();
-            if (driven && m_result.iterations < m_options.max_iterations && take_qp_step()) continue;
+            if (m_result.iterations < m_options.max_iterations) {
+                const ModelStep step = take_model_step(driven, stalls);
+                if (step == ModelStep::blocked) return fail(ZoneStatus::blocked);
+                if (step == ModelStep::taken) continue;
+            }
             if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
                 return fail(ZoneStatus::no_descent);
             const Accuracy now = current_accuracy();
             m_result.residual = now.residual;
+            if (driven && leave_saddle(now)) continue;
             set_step_end();
             const double rounding_step = 16.0 * kEpsilon * m_path.position();
             if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
@@ -273,42 +288,55 @@ private:
             futile = driven && !lower ? futile + 1 : 0;
             if (lower || !driven) lowest_energy = m_w.point.energy;
             if (futile >= kFutileSteps) return fail(ZoneStatus::no_descent);
-            const bool without_qp = !m_zone.nodes.empty() && m_qp_steps >= kMaxQpSteps;
-            steps_without_qp += without_qp ? 1 : 0;
-            if (m_result.iterations >= m_options.max_iterations || steps_without_qp > kStepsWithoutQp)
-                return fail(ZoneStatus::too_many_iterations);
+            if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
 
-            if (!driven && relaxations == 0) {
-                const double step = past_impacts(0.0, false);
-                const DriveProgress progress = advance_drives(step, stalls);
-                if (progress == DriveProgress::blocked) return fail(ZoneStatus::blocked);
-                if (step < 1.0) relaxations = kRelaxations;
-                if (progress == DriveProgress::moved) accept_trial();
-                continue;
-            }
-            relaxations = now.residual < kRelaxed ? 0 : std::max(relaxations - 1, 0);
             // The step's end may lie where contacts have not been listed yet. New ones are beyond their rest distance
             // here, so energy and derivatives stand.
             m_path.ensure_covered(m_w.y_end);
             double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
-            if (driven && step < kClampedStep && !without_qp)
-                step = past_impacts(step, true);
-            else if (step < 1.0 || !m_path.gates_hold(m_w.y_end))
-                step = m_path.arc_step(m_w.y_end, step);
+            if (step < 1.0 || !m_path.gates_hold(m_w.y_end)) step = m_path.arc_step(m_w.y_end, step);
             if (line_search(step)) {
+                m_near = m_newton.is_exact() && m_newton_full;
                 accept_trial();
                 const bool is_last = m_result.iterations + 1 >= m_options.max_iterations;
                 if (driven && !is_last && finish_with_this_factor()) {
                     ++m_result.iterations;
                     return;
                 }
-            } else if (!driven) {
-                relaxations = 0;
-            } else {
+            } else if (driven) {
                 if (now.residual >= good) fail(ZoneStatus::no_descent);
                 return;
             }
         }
+    }
+
+    /// Near a point of balance that is a saddle of the energy, where descent hardly moves: go off it along negative curvature,
+    /// by the largest part of the contacts' range that lowers the energy. Once is enough: from there descent goes on.
+    bool leave_saddle(const Accuracy& now) {
+        if (m_left_saddle || !m_zone.nodes.empty() || m_newton.is_exact() || now.residual > kNearSolution) return false;
+        m_left_saddle = true;
+        const Coordinates newton_step = m_w.step;
+        if (m_newton.off_saddle(m_zone, m_w.derivatives, m_w.system, m_w.step) && follow_off_saddle()) return true;
+        m_w.step = newton_step;
+        return false;
+    }
+
+    /// Go along the direction in m_w.step. False where that lowers the energy nowhere.
+    bool follow_off_saddle() {
+        if (m_w.point.active.empty()) return false;
+        set_step_end();
+        double range = kInfinity;
+        for (const ActiveContact& active : m_w.point.active) {
+            const ContactRange& r = m_zone.contacts[active.index].range;
+            range = std::min(range, r.rest - r.floor);
+        }
+        const double scale = range / largest_move();
+        for (Vec6& s : m_w.step.bodies) s *= scale;
+        set_step_end();
+        m_path.ensure_covered(m_w.y_end);
+        if (!line_search(m_path.arc_step(m_w.y_end, 1.0))) return false;
+        accept_trial();
+        return true;
     }
 
     /// (M + dt² K) Δy = -dE/dy, so often. From y = 0 that is  (M + dt² K) v1 = M v0 + dt f  [Qiao et al. 2020, Eq. 3].
@@ -329,45 +357,40 @@ private:
         m_result.residual = current_accuracy().residual;
     }
 
-    /// Let m_w.y_end be where the QP of all nearby contacts leads, and return how much of the way is free for all that is
-    /// listed there.
-    double follow_impacts() {
-        m_newton.lose_factor();  // the QP factorizes its own matrix
-        const ImpactDirection direction = m_path.past_impacts();
-        m_qp_steps += direction.newton_steps;
-        m_w.y_end = direction.y_end;
-        return direction.step;
-    }
-
-    /// CCD stopped the Newton step: look for a way past the impacts. Returns the allowed step to m_w.y_end.
-    double past_impacts(double newton_limit, bool driven) {
-        const Coordinates newton_end = m_w.y_end;
-        const double free = follow_impacts();
-        const bool good = !driven || (slope(m_w.derivatives.gradient) < 0.0 && free >= newton_limit);
-        if (good) return m_path.step_past_impacts(m_w.y_end, free);
-        m_w.y_end = newton_end;
-        m_w.y_end.bodies.resize(m_zone.bodies.size());
-        for (std::size_t i = newton_end.bodies.size(); i < m_w.y_end.bodies.size(); ++i)
-            m_w.y_end.bodies[i] = m_zone.bodies[i].target;
-        return m_path.covered_step(m_w.y_end);
-    }
-
-    /// Where many contacts come and go, as when flat faces land on each other, a Newton step only tells which of them push
-    /// after it; the QP finds those that push together. So bodies that are far from balance go where the QP leads, and on
-    /// for as long as that takes them nearer fast. False, and nowhere gone, otherwise.
-    bool take_qp_step() {
-        const double before = m_result.residual;
-        const bool go_on = std::exchange(m_last_was_qp, false);
-        if (!m_zone.nodes.empty() || !(before > (go_on ? kNearBalance : kFarFromBalance))) return false;
+    /// Far from the solution: go where the model of all near contacts leads, the whole way.
+    enum class ModelStep { taken, near, blocked };
+    ModelStep take_model_step(bool driven, int& stalls) {
+        if ((m_near || m_model_factors > kMaxModelFactors) && driven) return ModelStep::near;
         differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
-        const double now = m_result.residual = current_accuracy().residual;
-        if (!(now > kFarFromBalance || (go_on && now > kNearBalance && now < 0.5 * before))) return false;
-        const double free = follow_impacts();
-        if (!(slope(m_w.derivatives.gradient) < 0.0) || !line_search(m_path.step_past_impacts(m_w.y_end, free)))
-            return false;
-        if (!(m_w.trial.energy < m_w.point.energy - current_noise())) return false;  // forces are rounding
+        m_result.residual = current_accuracy().residual;
+        if (driven && m_result.residual < kNearSolution) return ModelStep::near;
+        m_newton.lose_factor();
+        const ModelDirection::Way way = m_model.find(m_w.derivatives.gradient, driven, m_w.y_end);
+        if (!m_zone.nodes.empty()) m_model_factors += way.newton_steps;
+        if (!way.found) return ModelStep::near;
+        const double step = m_path.covered_step(m_w.y_end, way.free);
+        if (!driven) {
+            const DriveProgress progress = advance_drives(step, stalls);
+            if (progress == DriveProgress::blocked) return ModelStep::blocked;
+            if (progress == DriveProgress::moved) accept_trial();
+            return ModelStep::taken;
+        }
+        if (!(step > 0.0)) return ModelStep::near;
+        m_path.set_trial(m_w.y_end, step);
+        if (step == 1.0) m_w.trial.y = m_w.y_end;
+        evaluate(m_zone, m_w.trial, &m_w.point);
+        const double change = m_w.trial.energy - m_w.point.energy, noise = current_noise();
+        if (change > noise) {
+            // What rises with bodies is the contacts' energy, where rows are not true to them. Cloth buckles: a shorter step will do.
+            if (m_zone.nodes.empty() || !line_search(m_path.arc_step(m_w.y_end, 0.5 * step))) {
+                m_model.damp(m_w.trial, change);
+                return ModelStep::taken;
+            }
+        }
         accept_trial();
-        return m_last_was_qp = true;
+        m_model.relax();
+        m_near = change > -noise || (step == 1.0 && m_model.knew_who_pushes());
+        return ModelStep::taken;
     }
 
     /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
@@ -412,10 +435,13 @@ private:
     std::vector<Box>& m_visited;
     HardContacts m_hard;
     ZonePath m_path;
-    int m_qp_steps = 0;  // Newton steps of impact QPs so far
+    ModelDirection m_model;
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
-    bool m_last_was_qp = false;              // of the steps so far
+    bool m_newton_full = false;              // the last line search took the whole step
+    int m_model_factors = 0;                 // of models with cloth so far
+    bool m_left_saddle = false;
+    bool m_near = false;  // the last model step was a Newton step: nothing that pushes changed
     ZoneResult m_result;
 };
 

@@ -3,7 +3,7 @@
 #include <optional>
 #include <vector>
 
-#include "contact/impact_direction.hpp"
+#include "contact/zone_contacts.hpp"
 
 namespace diffsim {
 
@@ -47,8 +47,8 @@ struct ZoneWorkspace {
     Box swept;
 };
 
-/// Minimise the zone's energy from y = 0 by Newton's method, every iterate penetration-free: contacts are listed,
-/// warm-started and stopped by CCD as docs/contact.md describes. On return workspace.point is the last iterate: the
+/// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts after
+/// the other, the last steps by Newton's method, as docs/solver.md describes. On return workspace.point is the last iterate: the
 /// minimiser, or if the status says so the last penetration-free point before failure. `visited`, one box per dynamic
 /// body, receives the space swept by the bodies' vertices in the zone frame.
 ZoneResult solve_zone(

@@ -41,7 +41,9 @@ def test_batched_upstream_of_a_batch_and_of_parameters() -> None:
     sim = two_bodies()
     sim.mass.requires_grad_()
     states = sim.initial_state(batch=3)
-    force = torch.randn(3, 2, 3, dtype=torch.float64, requires_grad=True)
+    force = torch.randn(3, 2, 3, dtype=torch.float64)
+    force[:, 1] = 0.0  # of the body that is driven
+    force.requires_grad_()
     end = sim(states, ds.Control(force=force)).velocity
     upstream = torch.randn(4, *end.shape, dtype=torch.float64)
     found = torch.autograd.grad(end, (sim.mass, force), upstream, is_grads_batched=True, retain_graph=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_scenes import only_read
 from test_robustness import PRESS, squeeze
 
 import diffsim as ds
@@ -49,6 +50,7 @@ def test_a_step_is_replayed_bit_by_bit(tmp_path: Path, batch: int | None, dtype:
     control = ds.Control(
         force=torch.full_like(state.position, 0.3), node_velocity=torch.full_like(state.node_position, 0.1)
     )
+    control = only_read(sim, control)
     path = tmp_path / "step.kept"
     diagnostics.dump(sim, state.replace(velocity=state.velocity.clone().requires_grad_()), control, path)
     expected = sim(state, control)

@@ -1,13 +1,13 @@
-#include "contact/impact_row.hpp"
+#include "contact/contact_row.hpp"
 
 #include "math/rotation.hpp"
 
 namespace diffsim {
 
-ImpactRow make_row(
+ContactRow make_row(
     const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const Placement& at,
     const Coordinates& y_now, double wanted) {
-    ImpactRow row;
+    ContactRow row;
     row.pair = contact.pair;
     row.stiffness = contact.stiffness.value;
     row.missing = wanted - geometry.distance;
@@ -57,7 +57,7 @@ ImpactRow make_row(
 namespace {
 
 /// What a row of these bodies is multiplied with.
-Vector<9> relative_motion(const ImpactRow& row, const Coordinates& p) {
+Vector<9> relative_motion(const ContactRow& row, const Coordinates& p) {
     Vector<9> motion = Vector<9>::Zero();
     if (row.a >= 0) {
         motion.head<3>() = p.bodies[row.a].head<3>();
@@ -70,7 +70,7 @@ Vector<9> relative_motion(const ImpactRow& row, const Coordinates& p) {
     return motion;
 }
 
-double row_times(const ImpactRow& row, const Vector<9>& motion, const Coordinates& p) {
+double row_times(const ContactRow& row, const Vector<9>& motion, const Coordinates& p) {
     double sum = row.relative.dot(motion);
     for (std::size_t k = 0; k < row.nodes.size(); ++k) sum += row.node_rows[k].dot(p.nodes[row.nodes[k]]);
     return sum;
@@ -78,9 +78,9 @@ double row_times(const ImpactRow& row, const Vector<9>& motion, const Coordinate
 
 }  // namespace
 
-double row_times(const ImpactRow& row, const Coordinates& p) { return row_times(row, relative_motion(row, p), p); }
+double row_times(const ContactRow& row, const Coordinates& p) { return row_times(row, relative_motion(row, p), p); }
 
-void rows_times(const std::vector<ImpactRow>& rows, const Coordinates& p, std::vector<double>& products) {
+void rows_times(const std::vector<ContactRow>& rows, const Coordinates& p, std::vector<double>& products) {
     products.resize(rows.size());
     visit_runs(rows, [&](std::size_t first, std::size_t last) {
         const Vector<9> motion = relative_motion(rows[first], p);
@@ -88,7 +88,7 @@ void rows_times(const std::vector<ImpactRow>& rows, const Coordinates& p, std::v
     });
 }
 
-void add_row(const ImpactRow& row, double force, Coordinates& sum) {
+void add_row(const ContactRow& row, double force, Coordinates& sum) {
     if (row.a >= 0) sum.bodies[row.a] += force * row.row_a();
     if (row.b >= 0) sum.bodies[row.b] += force * row.row_b();
     for (std::size_t k = 0; k < row.nodes.size(); ++k) sum.nodes[row.nodes[k]] += force * row.node_rows[k];
