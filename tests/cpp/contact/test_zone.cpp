@@ -3,6 +3,7 @@
 #include <Eigen/Eigenvalues>
 #include <utility>
 
+#include "contact/contact_row.hpp"
 #include "fixtures.hpp"
 
 using namespace diffsim;
@@ -147,6 +148,15 @@ MatrixX mass_matrix(const Zone& zone) {
     return M;
 }
 
+MatrixX smooth_hessian(
+    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut) {
+    ZoneDerivatives derivatives;
+    BlockSystem system;
+    system.set_pattern(base_pattern(zone));
+    differentiate_smooth(zone, point, pushing, cut, derivatives, system);
+    return dense(system);
+}
+
 double lowest_eigenvalue(const MatrixX& symmetric) {
     return Eigen::SelfAdjointEigenSolver<MatrixX>(symmetric, Eigen::EigenvaluesOnly).eigenvalues()[0];
 }
@@ -227,6 +237,38 @@ TEST(dropped_curvature_leaves_mass_and_rows) {
         CHECK_NEAR(dropped.hessian, expected, 1e-12 * expected.norm());
         const Derivatives exact = derivatives_at(zone, point, Curvature::full);
         CHECK((dropped.hessian - exact.hessian).norm() > 1e-3 * exact.hessian.norm());
+    });
+}
+
+TEST(curvature_of_contacts_with_forces_of_their_own_agrees_with_differences) {
+    for_stable_zones(3, [](const Zone& zone, const Coordinates& y, const ZonePoint& point) {
+        check::Random random(5);
+        std::vector<PushingContact> pushing;
+        for (const ActiveContact& active : point.active)
+            if (active.geometry.sine_sq >= kParallelLimit)
+                pushing.push_back({active.index, &active.geometry, random.uniform(0.5, 2.0)});
+        CHECK(pushing.size() >= 20);
+        // - force d(distance)/dy, the forces held fixed
+        const auto gradient = [&](const VectorX& x) {
+            const ZonePoint there = point_at(zone, y, x);
+            const Placement at{there.y, there.poses, there.nodes};
+            Coordinates sum;
+            sum.assign_zero(3, 0);
+            for (const PushingContact& push : pushing) {
+                const ZoneContact& contact = zone.contacts[push.index];
+                const ContactGeometry geometry = contact_geometry(zone, contact, there.poses, there.nodes);
+                add_row(make_row(zone, contact, geometry, at, there.y, 0.0), -push.force, sum);
+            }
+            return flatten(sum);
+        };
+        const MatrixX M = mass_matrix(zone);
+        const MatrixX exact = smooth_hessian(zone, point, pushing, kNothingCut) - M;
+        const MatrixX projected = smooth_hessian(zone, point, pushing, kAllCut) - M;
+        CHECK(exact.norm() > 1.0);
+        CHECK_NEAR(exact, fixtures::numeric_jacobian(gradient, VectorX::Zero(18), kStep), kDifferences * exact.norm());
+        CHECK(lowest_eigenvalue(exact) < -1e-3);
+        CHECK(lowest_eigenvalue(projected) >= -1e-12 * projected.norm());
+        CHECK(smooth_hessian(zone, point, {}, kNothingCut) == M);
     });
 }
 

@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "cloth_fixtures.hpp"
-#include "contact/impact_qp.hpp"
+#include "contact/contact_row.hpp"
 
 using namespace diffsim;
 using fixtures::dense;
@@ -302,7 +302,7 @@ TEST(dropped_curvature_leaves_mass_elasticity_and_rows) {
     });
 }
 
-TEST(impact_rows_are_the_gradients_of_distances) {
+TEST(contact_rows_are_the_gradients_of_distances) {
     for_stable_zones(2, [](const Zone& zone, const Coordinates& y, const ZonePoint& point) {
         constexpr double kWanted = 0.3;
         check::Random random(4);
@@ -320,7 +320,7 @@ TEST(impact_rows_are_the_gradients_of_distances) {
         for (const ActiveContact& active : point.active) {
             const ZoneContact& contact = zone.contacts[active.index];
             if (active.geometry.sine_sq < kParallelLimit) continue;
-            const ImpactRow row = make_row(zone, contact, active.geometry, at, y, kWanted);
+            const ContactRow row = make_row(zone, contact, active.geometry, at, y, kWanted);
             const auto along = [&](const Vec6& twist, const VectorX& nodes) {
                 double sum = row.a == 0 ? row.row_a().dot(twist) : row.b == 0 ? row.row_b().dot(twist) : 0.0;
                 for (std::size_t k = 0; k < row.nodes.size(); ++k)
@@ -331,10 +331,57 @@ TEST(impact_rows_are_the_gradients_of_distances) {
             CHECK_NEAR(along(all.head<6>(), all.tail(all.size() - 6)), numeric, 1e-6);
             CHECK_NEAR(row.missing, kWanted - active.geometry.distance, 1e-14);
             // Counted from elsewhere, what p makes up for has grown by the way from there.
-            const ImpactRow from = make_row(zone, contact, active.geometry, at, elsewhere, kWanted);
+            const ContactRow from = make_row(zone, contact, active.geometry, at, elsewhere, kWanted);
             const Vec6 back = y.bodies[0] - elsewhere.bodies[0];
             CHECK_NEAR(from.missing, row.missing + along(back, -shift), 1e-13);
         }
+    });
+}
+
+TEST(curvature_of_contacts_of_cloth_with_forces_of_their_own_agrees_with_differences) {
+    for_stable_zones(2, [](const Zone& zone, const Coordinates& y, const ZonePoint& point) {
+        check::Random random(5);
+        std::vector<PushingContact> pushing;
+        std::vector<int> contacts;
+        for (const ActiveContact& active : point.active) {
+            if (active.geometry.sine_sq < kParallelLimit) continue;
+            pushing.push_back({active.index, &active.geometry, random.uniform(0.5, 2.0)});
+            contacts.push_back(active.index);
+        }
+        CHECK(pushing.size() >= 20);
+        const std::vector<int> rows = free_rows(zone);
+        const auto smooth = [&](const std::vector<PushingContact>& with, CutShare cut) -> MatrixX {
+            ZoneDerivatives derivatives;
+            BlockSystem system;
+            system.set_pattern(base_pattern(zone));
+            ensure_pattern(zone, contacts, system);
+            differentiate_smooth(zone, point, with, cut, derivatives, system);
+            return dense(system)(rows, rows);
+        };
+        // - force d(distance)/dy, the forces held fixed
+        const auto gradient = [&](const VectorX& x) -> VectorX {
+            const ZonePoint there = point_at(zone, y, x);
+            const Placement at{there.y, there.poses, there.nodes};
+            Coordinates sum;
+            sum.assign_zero(1, zone.nodes.size());
+            for (const PushingContact& push : pushing) {
+                const ZoneContact& contact = zone.contacts[push.index];
+                const ContactGeometry geometry = contact_geometry(zone, contact, there.poses, there.nodes);
+                add_row(make_row(zone, contact, geometry, at, there.y, 0.0), -push.force, sum);
+            }
+            return flatten(sum)(rows);
+        };
+        Zone loose = zone;
+        loose.contacts.clear();
+        const MatrixX alone = derivatives_at(loose, point_at(loose, y, zero_change(loose)), Curvature::full).hessian;
+        CHECK_NEAR(smooth({}, kNothingCut), alone, 1e-12 * alone.norm());
+        const MatrixX exact = smooth(pushing, kNothingCut) - alone;
+        CHECK(exact.norm() > 1.0);
+        CHECK(exact.topRightCorner(6, exact.cols() - 6).norm() > 0.0);
+        CHECK_NEAR(exact, fixtures::numeric_jacobian(gradient, zero_change(zone), kStep), kDifferences * exact.norm());
+        const MatrixX projected = smooth(pushing, kAllCut) - smooth({}, kAllCut);
+        CHECK(lowest_eigenvalue(exact) < -1e-3);
+        CHECK(lowest_eigenvalue(projected) >= -1e-11 * projected.norm());
     });
 }
 
