@@ -356,3 +356,39 @@ TEST(an_allowed_step_keeps_cloth_above_its_floor) {
     CHECK(stopped >= 15);
     CHECK(allowed >= 1);
 }
+
+TEST(contacts_with_a_driven_body_are_listed_for_all_its_way) {
+    // A free box that stands, and a driven one that comes near it: by a way on which it stands still, too.
+    Model model;
+    model.thickness = kThickness;
+    for (const BodyKind kind : {BodyKind::dynamic, BodyKind::kinematic})
+        model.bodies.push_back(fixtures::body(fixtures::box(Vec3(0.3, 0.2, 0.1)), 0.5 * kThickness, kind));
+    std::vector<ClothParameters> materials;
+    Zone zone;
+    start_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+    zone.bodies.push_back(fixtures::zone_body(0, Pose(), 1.0, Mat3::Identity()));
+    zone.dynamic_count = 1;
+    const Vec6 target = -0.4 * Vec6::Unit(3);  // and so ends half the thickness from the other
+    const Vec3 place(1.0 + 0.5 * kThickness, 0.0, 0.0);
+    const PassiveBodies passive = fixtures::passive_bodies(model, {{1, {Mat3::Identity(), place}, target}});
+    Coordinates begin, end;
+    begin.assign_zero(1, 0);
+    end.assign_zero(1, 0);
+    ContactCoverage coverage;
+    collect_contacts(zone, passive, begin, end, coverage);
+    CHECK(zone.body_count() == 2);
+    CHECK(end.bodies[1] == target);
+    const auto listed = [&] {
+        std::set<Key> keys;
+        for (const ZoneContact& contact : zone.contacts) keys.insert(key(contact.contact));
+        return keys;
+    };
+    const std::set<Key> all = listed();
+    CHECK(all.size() >= 8);
+    end.bodies[1].setZero();
+    collect_contacts(zone, passive, begin, end, coverage);
+    CHECK(listed() == all);
+    begin.bodies[1] = end.bodies[1] = 0.5 * target;
+    collect_contacts(zone, passive, begin, end, coverage);
+    CHECK(listed() == all);
+}
