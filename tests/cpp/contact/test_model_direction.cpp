@@ -1,6 +1,7 @@
 #include "contact/model_direction.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <optional>
 
 #include "cloth_fixtures.hpp"
@@ -53,6 +54,13 @@ struct Scene {
             target[5] = (i == 0 ? 1.0 : -1.0) * std::abs(target[5]);
             add_box({i == 0 ? Mat3(Mat3::Identity()) : tilt, Vec3(x + 0.01, 0.02, i * (kHalf + reach + gap))}, target);
         }
+    }
+    /// An edge on an edge, `gap` apart, crossing it at this angle.
+    void add_crossing(check::Random& random, double angle, double gap, const Vec6& target_below) {
+        const Mat3 on_edge = exp_rotation(Vec3(0.25 * fixtures::kPi, 0.0, 0.0));
+        const Vec3 above(random.uniform(-0.01, 0.01), 0.0, 2.0 * std::sqrt(2.0) * kHalf + gap);
+        add_box({on_edge, Vec3::Zero()}, target_below);
+        add_box({exp_rotation(Vec3(0.0, 0.0, angle)) * on_edge, above}, Vec6::Zero());
     }
     /// At the start of the step.
     void start() {
@@ -159,19 +167,26 @@ bool turns_over(const Scene& scene, const Coordinates& y_end, const std::vector<
     });
 }
 
-double length_sq(const Zone& zone, const Coordinates& y, int i) {
-    return y.bodies[i].dot(mass_times(zone.bodies[i], y.bodies[i]));
+/// Of the first pair's motion, by its masses.
+double length(const Zone& zone, const Coordinates& y) {
+    double sum = 0.0;
+    for (std::size_t i = 0; i < 2; ++i) sum += y.bodies[i].dot(mass_times(zone.bodies[i], y.bodies[i]));
+    return std::sqrt(sum);
 }
 
 }  // namespace
 
 TEST(ways_are_those_of_a_model_with_a_row_for_every_contact) {
     check::Random random(1);
-    int cases_hit = 0, curved = 0;
+    int cases_hit = 0, curved = 0, mollified = 0;
     for (int k = 0; k < 60; ++k) {
         NOTE(k);
         Scene scene;
-        for (int pair = 0; pair < 1 + k % 3; ++pair) scene.add_pair(random, k % 2 == 0 ? 0.05 : 0.3);
+        if (k % 4 == 3)  // nearly parallel edges
+            scene.add_crossing(
+                random, random.uniform(0.004, 0.02), kThickness * random.uniform(0.7, 1.5), 1e-3 * Vec6::Unit(5));
+        else
+            for (int pair = 0; pair < 1 + k % 3; ++pair) scene.add_pair(random, k % 2 == 0 ? 0.05 : 0.3);
         scene.start();
         scene.end();  // which may list more contacts
         scene.direction.emplace(scene.zone, *scene.path, scene.point, scene.system);
@@ -191,6 +206,7 @@ TEST(ways_are_those_of_a_model_with_a_row_for_every_contact) {
             check_same(y_end, reference.y_end, kAgreement);
             const double change = (fixtures::flatten(y_end) - fixtures::flatten(last)).norm();
             curved += model == 1 && change > 1e-6 ? 1 : 0;
+            mollified += k % 4 == 3 ? 1 : 0;
             ++cases_hit;
             forces = reference.forces(scene.zone);
             last = y_end;
@@ -198,6 +214,7 @@ TEST(ways_are_those_of_a_model_with_a_row_for_every_contact) {
     }
     CHECK(cases_hit >= 60);
     CHECK(curved >= 10);
+    CHECK(mollified >= 10);
 }
 
 TEST(where_the_gradient_of_the_energy_vanishes_the_model_leads_nowhere) {
@@ -205,14 +222,11 @@ TEST(where_the_gradient_of_the_energy_vanishes_the_model_leads_nowhere) {
     int compressed = 0, mollified = 0;
     for (int k = 0; k < 40; ++k) {
         NOTE(k);
-        // An edge on an edge, crossing it at a small angle; targets such that the contact holds them.
+        // Targets such that the contact holds the bodies.
         Scene scene;
-        const double angle = k % 2 == 0 ? random.uniform(0.004, 0.02) : random.uniform(0.1, 1.0);
-        const double gap = kThickness * random.uniform(0.7, 0.95);
-        const Mat3 on_edge = exp_rotation(Vec3(0.25 * fixtures::kPi, 0.0, 0.0));
-        const Vec3 above(random.uniform(-0.01, 0.01), 0.0, 2.0 * std::sqrt(2.0) * kHalf + gap);
-        scene.add_box({on_edge, Vec3::Zero()}, Vec6::Zero());
-        scene.add_box({exp_rotation(Vec3(0.0, 0.0, angle)) * on_edge, above}, Vec6::Zero());
+        scene.add_crossing(
+            random, k % 2 == 0 ? random.uniform(0.004, 0.02) : random.uniform(0.1, 1.0),
+            kThickness * random.uniform(0.7, 0.95), Vec6::Zero());
         scene.start();
         const Coordinates pushes = scene.gradient();  // of the contacts alone
         for (int i = 0; i < 2; ++i)
@@ -232,7 +246,7 @@ TEST(where_the_gradient_of_the_energy_vanishes_the_model_leads_nowhere) {
 
 TEST(ways_that_are_stopped_are_led_past_what_stops_them) {
     check::Random random(3);
-    int stopped = 0, freed = 0, turned = 0, turned_freed = 0;
+    int stopped = 0, freed = 0, turned = 0, near = 0;
     for (int k = 0; k < 300; ++k) {
         NOTE(k);
         Scene scene;
@@ -248,12 +262,15 @@ TEST(ways_that_are_stopped_are_led_past_what_stops_them) {
         freed += way.free == 1.0 ? 1 : 0;
         if (!turns_over(scene, reference.y_end, impacts)) continue;
         ++turned;
-        turned_freed += way.free == 1.0 ? 1 : 0;
+        // A row that does not know which side it is on leads away from there, or back through the other body.
+        Coordinates change = y_end;
+        for (std::size_t i = 0; i < 2; ++i) change.bodies[i] -= reference.y_end.bodies[i];
+        near += length(scene.zone, change) < 0.3 * length(scene.zone, reference.y_end) ? 1 : 0;
     }
     CHECK(stopped >= 40);
     CHECK(10 * freed >= 9 * stopped);
-    CHECK(turned >= 5);
-    CHECK(10 * turned_freed >= 9 * turned);
+    CHECK(turned >= 40);
+    CHECK(near >= turned / 2);
 }
 
 TEST(damping_slows_the_bodies_whose_contacts_ask_for_it_alone) {
@@ -294,11 +311,8 @@ TEST(damping_slows_the_bodies_whose_contacts_ask_for_it_alone) {
         CHECK_NEAR(damped.bodies[4], scene.zone.bodies[4].target, 1e-15);
         // Rows may be made again where the way of the first pair ends: they are others for all.
         for (int i = 2; i < 4; ++i) CHECK_NEAR(more.bodies[i], plain.bodies[i], 1e-3 * plain.bodies[i].norm());
-        const auto length = [&](const Coordinates& y) {
-            return length_sq(scene.zone, y, 0) + length_sq(scene.zone, y, 1);
-        };
-        CHECK(length(damped) < 0.9 * length(plain));
-        CHECK(length(more) < 0.9 * length(damped));
+        CHECK(length(scene.zone, damped) < 0.95 * length(scene.zone, plain));
+        CHECK(length(scene.zone, more) < 0.95 * length(scene.zone, damped));
         check_same(undone, plain, 1e-14);
         check_same(half_undone, damped, 1e-14);
         ++cases_hit;
