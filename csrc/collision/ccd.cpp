@@ -158,11 +158,16 @@ struct EdgeEdge {
         const Vectors<2> a0 = a[0].over(begin, end), a1 = a[1].over(begin, end);
         const Vectors<2> b0 = b[0].over(begin, end), b1 = b[1].over(begin, end);
         const Vectors<2> edge_a = difference(a1, a0), edge_b = difference(b1, b0);
-        const bool inside_a = points.slide_count_a == 1, inside_b = points.slide_count_b == 1;
+        // A point on the border of its edge is an end: there edges may be as good as parallel, without a common normal.
+        const bool inside_a = points.slide_count_a > points.border_count_a;
+        const bool inside_b = points.slide_count_b > points.border_count_b;
         if (inside_a && inside_b)
             return diffsim::turning_reach(features, bernstein_product(edge_a, edge_b, cross), offset, begin, end, keep);
-        const Vectors<2>& end_a = points.feature_code / 3 == 0 ? a0 : a1;
-        const Vectors<2>& end_b = points.feature_code % 3 == 0 ? b0 : b1;
+        const auto is_first = [](const Vec3& point, const Vectors<2>& first, const Vectors<2>& second) {
+            return (point - first[0]).squaredNorm() < (point - second[0]).squaredNorm();
+        };
+        const Vectors<2>& end_a = is_first(points.point_a, a0, a1) ? a0 : a1;
+        const Vectors<2>& end_b = is_first(points.point_b, b0, b1) ? b0 : b1;
         if (inside_a)
             return diffsim::turning_reach(
                 features, edge_normal(edge_a, difference(end_b, a0)), offset, begin, end, keep);
