@@ -161,10 +161,13 @@ ModelSolution minimise(
         add(t, w.step, p);
         add(t, w.smooth_step, w.smooth_p);
         for (std::size_t r = 0; r < count; ++r) w.violation[r] -= t * w.slope[r];
-        if (same) break;
+        if (same) {
+            result.status = ModelSolution::Status::solved;
+            break;
+        }
         set_pushes();
     }
-    result.status = ModelSolution::Status::solved;
+    if (result.status != ModelSolution::Status::solved) result.status = ModelSolution::Status::crawling;
     for (std::size_t r = 0; r < count; ++r) rows[r].force = share * rows[r].stiffness * std::max(0.0, w.violation[r]);
     return result;
 }

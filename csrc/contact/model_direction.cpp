@@ -426,7 +426,15 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
         }
         for (int round = 0; round < (m_first_touches.empty() ? kMaxRounds : kMaxFastRounds); ++round) {
             linearise_at(y_end, impacts);
-            if (!solve(p, way.newton_steps)) break;
+            if (!solve(p, way.newton_steps)) {
+                if (!m_zone.nodes.empty() || !m_with_curvature) break;
+                m_with_curvature = false;
+                make_model();
+                if (m_aim != nullptr) set_aim(*m_aim);
+                linearise_at(y_end, impacts);
+                p.assign_zero(body_count, node_count);
+                if (!solve(p, way.newton_steps)) break;
+            }
             set_end(p, y_end);
             if (!m_path.covers(y_end)) list_anew(y_end);
             const double free = allowed_step(m_zone, m_point, y_end, &impacts);
