@@ -49,8 +49,9 @@ bool NewtonDirection::factorize_bodies(
     differentiate(zone, point, Curvature::full, derivatives, &system);
     m_is_exact = m_has_factor = system.factorize();
     if (m_is_exact) return true;
-    m_exact.set_pattern(system.pattern());
-    m_exact.copy_values(system);
+    if (!m_exact) m_exact = std::make_unique<BlockSystem>();
+    m_exact->set_pattern(system.pattern());
+    m_exact->copy_values(system);
     differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
     m_has_factor = system.factorize();
     return m_has_factor;
@@ -74,7 +75,7 @@ bool NewtonDirection::off_saddle(
     Coordinates curved;
     double curvature = 0.0, slope = 0.0;
     for (int k = 0; k < kSaddleIterations; ++k) {
-        m_exact.multiply(step, curved);
+        m_exact->multiply(step, curved);
         curvature = slope = 0.0;
         for (std::size_t i = 0; i < count; ++i) {
             curvature += step.bodies[i].dot(curved.bodies[i]);

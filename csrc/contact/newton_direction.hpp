@@ -1,5 +1,7 @@
 #pragma once
 
+#include <memory>
+
 #include "contact/cut_search.hpp"
 #include "contact/zone.hpp"
 
@@ -32,7 +34,7 @@ private:
         const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system);
 
     CutSearch m_cut;
-    BlockSystem m_exact;  // the Hessian that was not positive definite
+    std::unique_ptr<BlockSystem> m_exact;  // the Hessian that was not positive definite, once there was one
     bool m_has_factor = false;
     bool m_is_exact = false;
 };

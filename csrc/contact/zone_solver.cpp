@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <utility>
 
 #include "contact/hard_contacts.hpp"
@@ -39,8 +40,7 @@ public:
           m_options(options),
           m_w(workspace),
           m_visited(visited),
-          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system),
-          m_model(zone, m_path, workspace.point, workspace.system) {}
+          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
 
     ZoneResult solve() {
         start();
@@ -50,6 +50,8 @@ public:
         }
         if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
         go_to_warm_start();
+        m_near =
+            m_zone.dynamic_count == 1 && m_zone.nodes.empty();  // a factor costs hardly more than the gradient alone
         iterate();
         if (m_zone.hard) harden();
         return m_result;
@@ -57,6 +59,7 @@ public:
 
 private:
     Coordinates& y() { return m_w.point.y; }
+    bool is_one_body() const { return m_zone.dynamic_count == 1 && m_zone.nodes.empty(); }
 
     // --- start -------------------------------------------------------------------------------------------------
 
@@ -78,9 +81,11 @@ private:
             return;
         }
         if (rescue) m_path.rescue();
-        m_model.start_from(m_w.point);
         m_visited.assign(count + m_zone.cloths.size(), Box());
         mark_visited();
+        if (is_one_body()) return;  // whose model is made if ever it is asked for, which at rest it is not
+        m_model.emplace(m_zone, m_path, m_w.point, m_w.system);
+        m_model->start_from(m_w.point);
     }
 
     /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that reach
@@ -280,6 +285,11 @@ private:
                 polish();
                 return;
             }
+            if (m_near && m_result.iterations == 0 && now.residual > kNearSolution) {
+                m_near = false;
+                --m_result.iterations;
+                continue;
+            }
             const double good = kGoodEnough * std::max(m_options.tolerance, now.floor);
             stagnant = now.residual < 0.5 * best_residual ? 0 : stagnant + 1;
             best_residual = std::min(best_residual, now.residual);
@@ -365,7 +375,8 @@ private:
         m_result.residual = current_accuracy().residual;
         if (driven && m_result.residual < kNearSolution) return ModelStep::near;
         m_newton.lose_factor();
-        const ModelDirection::Way way = m_model.find(m_w.derivatives.gradient, driven, m_w.y_end);
+        if (!m_model) m_model.emplace(m_zone, m_path, m_w.point, m_w.system);
+        const ModelDirection::Way way = m_model->find(m_w.derivatives.gradient, driven, m_w.y_end);
         if (!m_zone.nodes.empty()) m_model_factors += way.newton_steps;
         if (!way.found) return ModelStep::near;
         const double step = m_path.covered_step(m_w.y_end, way.free);
@@ -383,13 +394,13 @@ private:
         if (change > noise) {
             // What rises with bodies is the contacts' energy, where rows are not true to them. Cloth buckles: a shorter step will do.
             if (m_zone.nodes.empty() || !line_search(m_path.arc_step(m_w.y_end, 0.5 * step))) {
-                m_model.damp(m_w.trial, change);
+                m_model->damp(m_w.trial, change);
                 return ModelStep::taken;
             }
         }
         accept_trial();
-        m_model.relax();
-        m_near = change > -noise || (step == 1.0 && m_model.knew_who_pushes());
+        m_model->relax();
+        m_near = change > -noise || (step == 1.0 && m_model->knew_who_pushes());
         return ModelStep::taken;
     }
 
@@ -435,7 +446,7 @@ private:
     std::vector<Box>& m_visited;
     HardContacts m_hard;
     ZonePath m_path;
-    ModelDirection m_model;
+    std::optional<ModelDirection> m_model;  // made when first asked: most bodies at rest never do
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
     bool m_newton_full = false;              // the last line search took the whole step

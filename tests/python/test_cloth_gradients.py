@@ -19,7 +19,8 @@ DT = 0.01
 DRIVE = 0.01  # of pins [m/s]
 # How far to either side. At 1e-6 (parameters: 1e-4 of their value) differences of stiff folded cloth are off by up to
 # 3e-4, a tenth of that at 3e-7: their own error, which is of second order. Below 1e-7 rounding grows as 1 / eps.
-EPS = 1e-7
+EPS = 3e-7
+EPS_ON_SPHERE = 1e-7  # where those of 3e-7 are off by more
 # What the project promises for exact gradients, relative. Measured: median 1e-8 to 2e-7, at worst 2e-5.
 MEDIAN_TOLERANCE = 1e-6
 MAX_TOLERANCE = 1e-4
@@ -149,7 +150,8 @@ def test_rollouts_against_central_differences(name: str, coupling: str) -> None:
     assert contacts(sim, state, control) >= 3  # or nothing is tested
     names, checked, stable = inputs_of(sim), 0, []
     for seed in range(3):
-        report = gradcheck(sim, state, control, STEPS, wrt=names, directions=1, eps=EPS, seed=seed)
+        eps = EPS_ON_SPHERE if name == "cloth on sphere" else EPS
+        report = gradcheck(sim, state, control, STEPS, wrt=names, directions=1, eps=eps, seed=seed)
         assert not report.zero_gradients
         checked += len(report.directions)
         stable += report.stable
