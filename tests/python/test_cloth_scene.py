@@ -472,8 +472,10 @@ def joined_sheets(gap: float) -> shapes.Mesh:
 
 def test_sheets_of_any_size_do_not_touch_themselves() -> None:
     for size, nodes in ((1e-3, 20), (1.0, (70, 3)), ((50.0, 1.0), (2, 40))):
-        Scene().add_cloth(shapes.sheet(size, nodes))
-    Scene().add_cloth(shapes.icosphere(0.5, 3))
+        vertices, faces = shapes.sheet(size, nodes)
+        assert Scene().add_cloth((vertices, faces)).nodes == slice(0, len(vertices))  # and is not refused
+    ball = shapes.icosphere(0.5, 3)
+    assert Scene().add_cloth(ball).nodes == slice(0, len(ball[0]))
 
 
 def test_vertices_on_triangles_are_found_among_triangles_of_all_sizes() -> None:
