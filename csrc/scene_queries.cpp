@@ -6,9 +6,9 @@
 #include <stdexcept>
 #include <string>
 
-#include "contact/separation.hpp"
-#include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
+#include "solve/separation.hpp"
+#include "zone/zone_contacts.hpp"
 
 namespace diffsim {
 namespace {

@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "contact/zone.hpp"
+#include "zone/zone.hpp"
 
 /// Who the failure of a zone is about: objects (Model::name), ascending.
 namespace diffsim {

@@ -2,8 +2,8 @@
 
 #include <algorithm>
 
-#include "contact/zone_contacts.hpp"
 #include "math/rotation.hpp"
+#include "zone/zone_contacts.hpp"
 
 namespace diffsim {
 

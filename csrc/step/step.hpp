@@ -6,14 +6,14 @@
 #include <string>
 #include <vector>
 
-#include "contact/adjoint.hpp"
-#include "contact/linearised_zone.hpp"
-#include "contact/touching_zones.hpp"
-#include "contact/zone_solver.hpp"
+#include "adjoint/adjoint.hpp"
+#include "adjoint/linearised_zone.hpp"
 #include "model/state.hpp"
 #include "parallel/interrupt.hpp"
 #include "parallel/workers.hpp"
+#include "solve/zone_solver.hpp"
 #include "step/step_start.hpp"
+#include "step/touching_zones.hpp"
 
 /// One time step and its backward: the only place that knows the whole order.
 namespace diffsim {

@@ -1,9 +1,9 @@
 #pragma once
 
-#include "contact/zone.hpp"
 #include "dynamics/free_motion.hpp"
 #include "geometry/box.hpp"
 #include "model/state.hpp"
+#include "zone/zone.hpp"
 
 /// Bodies and cloths at the start of a step.
 namespace diffsim {

@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "contact/adjoint.hpp"
+#include "adjoint/adjoint.hpp"
 #include "step/step.hpp"
 
 namespace diffsim {

@@ -4,9 +4,9 @@
 #include <cmath>
 #include <vector>
 
-#include "contact/zone_contacts.hpp"
 #include "fixtures.hpp"
 #include "model/cloth.hpp"
+#include "zone/zone_contacts.hpp"
 
 namespace fixtures {
 

@@ -7,9 +7,9 @@
 #include <vector>
 
 #include "check.hpp"
-#include "contact/zone.hpp"
 #include "math/rotation.hpp"
 #include "model/model.hpp"
+#include "zone/zone.hpp"
 
 namespace fixtures {
 

@@ -3,7 +3,7 @@
 #include <algorithm>
 
 #include "cloth_fixtures.hpp"
-#include "contact/zone_contacts.hpp"
+#include "zone/zone_contacts.hpp"
 
 using namespace diffsim;
 using fixtures::random_rotation;

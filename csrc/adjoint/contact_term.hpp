@@ -1,0 +1,46 @@
+#pragma once
+
+#include "zone/zone.hpp"
+
+namespace diffsim {
+
+/// Vectors and matrices of up to two features of cloth, on the stack.
+using SmallVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, 18, 1>;
+using SmallMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, 18, 18>;
+
+/// The derivatives of an active contact and what they are taken along: one or two objects, each a body's twist (6) or the
+/// nodes of a cloth's feature (9).
+struct ContactTerm {
+    struct Side {
+        int body = kNobody;
+        std::array<int, 3> nodes = {-1, -1, -1};
+        int offset = 0;
+    };
+    std::array<Side, 2> sides;
+    int side_count = 2;
+    SmallVector row, gradient;
+    SmallMatrix hessian;
+    double stiffness;
+
+    /// Call body_part(body, offset) and node_part(node, offset) for everything the term is taken along.
+    template <class BodyPart, class NodePart>
+    void for_each(const BodyPart& body_part, const NodePart& node_part) const {
+        for (int s = 0; s < side_count; ++s) {
+            const Side& side = sides[static_cast<std::size_t>(s)];
+            if (side.body >= 0) {
+                body_part(side.body, side.offset);
+                continue;
+            }
+            for (int k = 0; k < 3; ++k) {
+                const int node = side.nodes[static_cast<std::size_t>(k)];
+                if (node >= 0) node_part(node, side.offset + 3 * k);
+            }
+        }
+    }
+};
+
+/// The derivatives of one active contact. Curvature::none leaves the Hessian unset, which of a body on the ground it
+/// always is.
+ContactTerm contact_term(const Zone& zone, const ZonePoint& point, const ActiveContact& active, Curvature curvature);
+
+}  // namespace diffsim

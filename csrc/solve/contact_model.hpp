@@ -1,0 +1,35 @@
+#pragma once
+
+#include "zone/contact_row.hpp"
+
+/// The convex model of a zone around its current point, all near contacts in it:
+///     m(p) = ½ pᵀ H p + gᵀ p + Σ stiffness/2 max(0, missing - rowᵀ p)².
+namespace diffsim {
+
+struct ContactModel {
+    BlockSystem smooth;            ///< H; its pattern has the rows' pairs
+    Coordinates gradient;          ///< g; zero at pinned nodes
+    std::vector<ContactRow> rows;  ///< one-sided; those of the same bodies follow each other
+};
+
+/// Memory of minimise(), kept from model to model.
+struct ModelWorkspace {
+    Coordinates smooth_p, gradient, step, smooth_step;
+    std::vector<double> violation, slope;
+    std::vector<char> pushes;
+};
+
+struct ModelSolution {
+    enum class Status { solved, indefinite, crawling } status = Status::indefinite;
+    int newton_steps = 0;  ///< factorizations
+};
+
+/// Minimise the model with its rows at this share of their stiffness, by Newton's method on the piecewise quadratic with
+/// exact line search: it ends with the first full step after which no row has changed sides. `p` holds the start, which
+/// pinned nodes keep, and receives the minimiser; the rows receive their forces. Where a step comes out shorter than
+/// `least_step` it is given up: too many rows change sides at once. Scratch: `system`, whose pattern is that of model.smooth.
+ModelSolution minimise(
+    ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& workspace,
+    Coordinates& p);
+
+}  // namespace diffsim

@@ -1,0 +1,492 @@
+#include "solve/model_direction.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <tuple>
+
+#include "zone/contact_assembly.hpp"
+#include "zone/motion_bounds.hpp"
+
+namespace diffsim {
+namespace {
+
+constexpr int kMaxListings = 8;     // for a way that leads out of the list it was found with
+constexpr int kMaxRounds = 2;       // of linearising again where a way ends
+constexpr double kMaxTurn = 0.5;    // [rad] of a fast body in one way
+constexpr int kMaxFastRounds = 10;  // where bodies move so fast for their size that they could pass each other
+constexpr int kMaxHalvings = 6;     // of the way of bodies that something still stops
+constexpr double kCrawling = 0.2;   // of a Newton step: rows are not followed so
+constexpr std::array<double, 3> kStages = {1e-2, 1e-1, 1.0};  // of the rows' stiffness
+constexpr double kProximal = 1.0;                             // of the inertia: the first damping of a body
+constexpr double kMoreProximal = 4.0;
+constexpr double kExcess = 0.1;  // of the largest excess of energy: contacts that ask for damping
+
+bool before(const Contact& c, const Contact& d) {
+    return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
+           std::tie(d.object_a, d.object_b, d.type, d.feature_a, d.feature_b);
+}
+
+}  // namespace
+
+ModelDirection::ModelDirection(Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system)
+    : m_zone(zone), m_path(path), m_point(point), m_system(system) {}
+
+// --- forces, across lists of contacts ---------------------------------------------------------------------------------
+
+void ModelDirection::recall_forces() {
+    if (m_list == m_path.list_number()) return;
+    m_list = m_path.list_number();
+    m_forces.assign(m_zone.contacts.size(), 0.0);
+    if (m_kept.empty()) return;
+    for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+        const Contact& contact = m_zone.contacts[k].contact;
+        const auto found = std::lower_bound(
+            m_kept.begin(), m_kept.end(), contact,
+            [](const auto& kept, const Contact& c) { return before(kept.first, c); });
+        if (found != m_kept.end() && !before(contact, found->first)) m_forces[k] = found->second;
+    }
+}
+
+void ModelDirection::start_from(const ZonePoint& point) {
+    m_kept.clear();
+    for (const ActiveContact& active : point.active) {
+        const ZoneContact& contact = m_zone.contacts[active.index];
+        const double pole = contact.range.rest - contact.range.pole;
+        const double push =
+            contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
+        const double force = edge_mollifier(active.geometry.sine_sq).value * push;
+        if (force > 0.0) m_kept.emplace_back(contact.contact, force);
+    }
+    std::sort(m_kept.begin(), m_kept.end(), [](const auto& a, const auto& b) { return before(a.first, b.first); });
+    m_list = -1;
+}
+
+void ModelDirection::keep_forces() {
+    m_kept.clear();
+    std::fill(m_forces.begin(), m_forces.end(), 0.0);
+    for (const ContactRow& row : m_model.rows) {
+        if (!(row.force > 0.0)) continue;
+        m_forces[row.contact] = row.force;
+        m_kept.emplace_back(m_zone.contacts[row.contact].contact, row.force);
+    }
+    std::sort(m_kept.begin(), m_kept.end(), [](const auto& a, const auto& b) { return before(a.first, b.first); });
+}
+
+// --- the model --------------------------------------------------------------------------------------------------------
+
+/// Near are contacts that push, did in the last model, or may come to on the way to where nothing holds the bodies.
+void ModelDirection::list_near() {
+    m_near.clear();
+    Coordinates free = m_point.y;
+    m_path.set_to_targets(free);
+    MotionBounds motion(m_zone, m_point.y, free);
+    auto active = m_point.active.begin();
+    for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+        const ZoneContact& contact = m_zone.contacts[k];
+        const int index = static_cast<int>(k);
+        while (active != m_point.active.end() && active->index < index) ++active;
+        if (active != m_point.active.end() && active->index == index) {
+            add_near(index, active->geometry);
+            continue;
+        }
+        if (m_forces[k] == 0.0 && m_point.distances[k] - motion.approach(contact) > contact.range.rest) continue;
+        add_near(index);
+    }
+}
+
+void ModelDirection::add_near(int index) {
+    const ZoneContact& contact = m_zone.contacts[index];
+    add_near(index, contact_geometry(m_zone, contact, m_point.poses, m_point.nodes));
+}
+
+/// A compressed contact has its secant stiffness, so that the row's force is the contact's where they are now.
+void ModelDirection::add_near(int index, const ContactGeometry& geometry) {
+    if (geometry.sine_sq == 0.0) return;  // parallel edges push nothing
+    const ZoneContact& contact = m_zone.contacts[index];
+    double stiffness = contact.stiffness.value;
+    const double compression = contact.range.rest - geometry.distance;
+    if (compression > 0.0)
+        stiffness =
+            contact_potential(compression, contact.range.rest - contact.range.pole, stiffness).force / compression;
+    m_near.push_back({index, geometry, edge_mollifier(geometry.sine_sq).value * stiffness});
+}
+
+void ModelDirection::sort_near() {
+    std::sort(m_near.begin(), m_near.end(), [](const auto& a, const auto& b) { return a.contact < b.contact; });
+}
+
+void ModelDirection::make_model() {
+    const bool with_nodes = !m_zone.nodes.empty();
+    m_model.smooth.set_pattern(m_system.pattern());
+    if (with_nodes) {
+        std::vector<int> contacts;
+        for (const NearContact& near : m_near) contacts.push_back(near.contact);
+        ensure_pattern(m_zone, contacts, m_model.smooth);
+        m_system.set_pattern(m_model.smooth.pattern());
+    }
+    m_pushing.clear();
+    if (m_with_curvature) {
+        for (const NearContact& near : m_near) {
+            const double force = m_forces[near.contact];
+            if (force > 0.0) m_pushing.push_back({near.contact, &near.geometry, force});
+        }
+    }
+    const CutShare cut = with_nodes ? m_cut.share() : kNothingCut;
+    differentiate_smooth(m_zone, m_point, m_pushing, cut, m_smooth, m_model.smooth);
+    for (int i = 0; i < m_zone.dynamic_count; ++i) {
+        const double weight = m_weight[static_cast<std::size_t>(i)];
+        if (weight == 0.0) continue;
+        m_model.smooth.diagonal(i).topLeftCorner<3, 3>() += weight * m_zone.bodies[i].inertia;
+        m_model.smooth.diagonal(i).diagonal().tail<3>().array() += weight * m_zone.bodies[i].mass;
+    }
+    for (int i = 0; i < m_zone.node_count(); ++i) {
+        const double weight = m_weight[static_cast<std::size_t>(m_zone.dynamic_count + i)];
+        if (weight != 0.0 && !m_zone.nodes[i].pinned)
+            m_model.smooth.node_diagonal(i).diagonal().array() += weight * m_zone.nodes[i].mass;
+    }
+
+    // The model has the energy's gradient: that of the rows which push now is in `gradient` already.
+    m_model.gradient = *m_gradient;
+    m_model.rows.clear();
+    m_at.y = m_point.y;
+    m_at.poses = m_point.poses;
+    m_at.nodes = m_point.nodes;
+    for (const NearContact& near : m_near) make_start_row(near);
+    if (!with_nodes || !m_zone.elastic) return;
+    std::vector<Vec3> driven(m_zone.nodes.size(), Vec3::Zero());
+    bool any = false;
+    for (int i = 0; i < m_zone.node_count(); ++i) {
+        if (!m_zone.nodes[i].pinned) continue;
+        driven[i] = m_zone.nodes[i].target - m_point.y.nodes[i];
+        any = any || !driven[i].isZero(0.0);
+    }
+    if (!any) return;
+    for (const ZoneCloth& cloth : m_zone.cloths)
+        add_elastic_hessian_product(
+            m_zone.model->cloths[cloth.id], (*m_zone.cloth_parameters)[cloth.id], m_zone.dt, cloth.start,
+            m_point.nodes.data() + cloth.first_node, driven.data() + cloth.first_node, m_zone.dt * m_zone.dt,
+            m_model.gradient.nodes.data() + cloth.first_node);
+    for (int i = 0; i < m_zone.node_count(); ++i)
+        if (m_zone.nodes[i].pinned) m_model.gradient.nodes[i].setZero();
+}
+
+void ModelDirection::make_start_row(const NearContact& near) {
+    const ZoneContact& contact = m_zone.contacts[near.contact];
+    ContactRow row = make_row(m_zone, contact, near.geometry, m_at, m_point.y, contact.range.rest);
+    row.contact = near.contact;
+    row.range = contact.range.rest - contact.range.floor;
+    row.stiffness = near.stiffness;
+    row.force = m_forces[near.contact];
+    const double compression = contact.range.rest - near.geometry.distance;
+    if (compression > 0.0) diffsim::add_row(row, row.stiffness * compression, m_model.gradient);
+    m_model.rows.push_back(std::move(row));
+}
+
+/// Cold, Newton's method crawls from one set of pushing rows to the next: from soft rows to stiff ones it gets there in a
+/// few steps each.
+bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
+    const Coordinates start = p;
+    ModelSolution solution = minimise(m_model, 1.0, kCrawling, m_system, m_work, p);
+    newton_steps += solution.newton_steps;
+    m_right_guess = solution.newton_steps == 1;
+    if (solution.status != ModelSolution::Status::crawling) return solution.status == ModelSolution::Status::solved;
+    p = start;
+    for (double share : kStages) {
+        solution = minimise(m_model, share, 0.0, m_system, m_work, p);
+        newton_steps += solution.newton_steps;
+        if (solution.status != ModelSolution::Status::solved) return false;
+    }
+    return true;
+}
+
+/// Contacts that the way may violate and that have no row yet get one. False if there are none.
+bool ModelDirection::add_missed(const Coordinates& y_end) {
+    MotionBounds motion(m_zone, m_point.y, y_end);
+    std::size_t near = 0;
+    const std::size_t known = m_near.size();
+    for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+        while (near < known && m_near[near].contact < static_cast<int>(k)) ++near;
+        if (near < known && m_near[near].contact == static_cast<int>(k)) continue;
+        const ZoneContact& contact = m_zone.contacts[k];
+        if (m_point.distances[k] - motion.approach(contact) <= contact.range.rest) add_near(static_cast<int>(k));
+    }
+    if (m_near.size() == known) return false;
+    sort_near();
+    return true;
+}
+
+/// Fast bodies that meet would whirl around each other, where rows mean nothing: heavier, they turn less. True if some got
+/// heavier.
+bool ModelDirection::turns_too_far(const Coordinates& p) {
+    bool too_far = false;
+    for (std::size_t i = 0; i < p.bodies.size(); ++i) {
+        const double turn = p.bodies[i].head<3>().norm();
+        if (turn <= 1.1 * kMaxTurn || !m_path.is_fast(static_cast<int>(i))) continue;
+        m_weight[i] = (1.0 + m_weight[i]) * turn / kMaxTurn - 1.0;
+        too_far = true;
+    }
+    return too_far;
+}
+
+void ModelDirection::set_end(const Coordinates& p, Coordinates& y_end) const {
+    y_end = m_point.y;
+    for (std::size_t i = 0; i < y_end.bodies.size(); ++i) {
+        if (static_cast<int>(i) < m_zone.dynamic_count)
+            y_end.bodies[i] += p.bodies[i];
+        else
+            y_end.bodies[i] = m_zone.bodies[i].target;
+    }
+    for (std::size_t i = 0; i < y_end.nodes.size(); ++i) {
+        if (m_zone.nodes[i].pinned)
+            y_end.nodes[i] = m_zone.nodes[i].target;
+        else
+            y_end.nodes[i] += p.nodes[i];
+    }
+}
+
+// --- where the way ends -----------------------------------------------------------------------------------------------
+
+/// Rows are straight and bodies turn: make them again where the way ends. A pair that was hit on the way and whose normal has
+/// turned over is on the other side of itself.
+void ModelDirection::linearise_at(const Coordinates& y_end, const std::vector<Impact>& impacts) {
+    const std::size_t known = m_near.size();
+    std::size_t near_index = 0;
+    for (const Impact& impact : impacts) {
+        while (near_index < known && m_near[near_index].contact < impact.contact) ++near_index;
+        if (near_index < known && m_near[near_index].contact == impact.contact) continue;
+        add_near(impact.contact);
+    }
+    if (m_near.size() > known) {
+        sort_near();
+        if (!m_zone.nodes.empty()) {  // the matrix has blocks for the rows that it was made for
+            make_model();
+            if (m_aim != nullptr) set_aim(*m_aim);
+        }
+    }
+    m_row_force.assign(m_zone.contacts.size(), 0.0);
+    for (const ContactRow& row : m_model.rows) m_row_force[row.contact] = row.force;
+    m_model.rows.clear();
+    m_at.y = y_end;
+    place(m_zone, y_end, m_at.poses, m_at.nodes);
+    auto impact = impacts.begin();
+    for (const NearContact& near : m_near) {
+        const ZoneContact& contact = m_zone.contacts[near.contact];
+        ContactGeometry geometry = contact_geometry(m_zone, contact, m_at.poses, m_at.nodes);
+        while (impact != impacts.end() && impact->contact < near.contact) ++impact;
+        const bool hit = impact != impacts.end() && impact->contact == near.contact;
+        if (m_path.is_fast(contact)) {
+            // Where the way ends such bodies are past each other: rows are of how they first touch, and stay.
+            if (hit) add_row_at_impact(near, impact->toi, y_end);
+            continue;
+        }
+        if (hit && !contact.contact.with_ground() && near.geometry.normal.dot(geometry.normal) < 0.0) {
+            geometry.normal = -geometry.normal;
+            geometry.distance = -geometry.distance;
+        }
+        add_row(near, geometry);
+    }
+    m_model.rows.insert(m_model.rows.end(), m_first_touches.begin(), m_first_touches.end());
+}
+
+void ModelDirection::add_row(const NearContact& near, const ContactGeometry& geometry) {
+    const ZoneContact& contact = m_zone.contacts[near.contact];
+    ContactRow row = make_row(m_zone, contact, geometry, m_at, m_point.y, contact.range.rest);
+    row.contact = near.contact;
+    row.range = contact.range.rest - contact.range.floor;
+    row.stiffness = near.stiffness;
+    row.force = m_row_force[near.contact];
+    m_model.rows.push_back(std::move(row));
+}
+
+void ModelDirection::add_row_at_impact(const NearContact& near, double toi, const Coordinates& y_end) {
+    const ZoneContact& contact = m_zone.contacts[near.contact];
+    const std::array<int, 2> bodies = {contact.a, contact.b};
+    std::array<Pose, 2> poses;
+    for (std::size_t k = 0; k < 2; ++k) {
+        const int i = bodies[k];
+        poses[k] = m_at.poses[i];
+        m_at.y.bodies[i] = m_point.y.bodies[i] + toi * (y_end.bodies[i] - m_point.y.bodies[i]);
+        m_at.poses[i] = pose_at(m_zone.bodies[i], m_at.y.bodies[i]);
+    }
+    add_row(near, contact_geometry(m_zone, contact, m_at.poses, m_at.nodes));
+    m_first_touches.push_back(std::move(m_model.rows.back()));
+    m_model.rows.pop_back();
+    for (std::size_t k = 0; k < 2; ++k) {
+        m_at.y.bodies[bodies[k]] = y_end.bodies[bodies[k]];
+        m_at.poses[bodies[k]] = poses[k];
+    }
+}
+
+/// Half the way for the bodies that are stopped.
+void ModelDirection::shorten_blocked(const std::vector<Impact>& impacts, Coordinates& p) const {
+    std::vector<char> body(m_zone.bodies.size(), 0), node(m_zone.nodes.size(), 0);
+    for (const Impact& impact : impacts) {
+        const ZoneContact& contact = m_zone.contacts[impact.contact];
+        for (bool of_a : {true, false}) {
+            if (!of_a && contact.contact.with_ground()) continue;
+            if ((of_a ? contact.cloth_a : contact.cloth_b) >= 0) {
+                for (int n : feature_nodes(m_zone, contact, of_a))
+                    if (n >= 0) node[n] = 1;
+            } else {
+                body[of_a ? contact.a : contact.b] = 1;
+            }
+        }
+    }
+    for (std::size_t i = 0; i < p.bodies.size(); ++i)
+        if (body[i]) p.bodies[i] *= 0.5;
+    for (std::size_t i = 0; i < p.nodes.size(); ++i)
+        if (node[i] && !m_zone.nodes[i].pinned) p.nodes[i] *= 0.5;
+}
+
+/// Let the model's smooth part be the distance to this motion, in its own metric.
+void ModelDirection::set_aim(const Coordinates& aim) {
+    m_model.smooth.multiply(aim, m_model.gradient);
+    for (Vec6& g : m_model.gradient.bodies) g = -g;
+    for (Vec3& g : m_model.gradient.nodes) g = -g;
+    for (int i = 0; i < m_zone.node_count(); ++i)
+        if (m_zone.nodes[i].pinned) m_model.gradient.nodes[i].setZero();
+}
+
+/// The way leads out of the list of contacts: list them for it, and make the model again.
+void ModelDirection::list_anew(Coordinates& y_end) {
+    keep_forces();
+    m_path.list_contacts(y_end);
+    evaluate(m_zone, m_point);
+    recall_forces();
+    list_near();
+    make_model();
+    if (m_aim != nullptr) set_aim(*m_aim);
+}
+
+ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool driven, Coordinates& y_end) {
+    Way way;
+    const std::size_t body_count = static_cast<std::size_t>(m_zone.dynamic_count), node_count = m_zone.nodes.size();
+    m_weight.resize(body_count + node_count, 0.0);
+    Coordinates p;
+    p.assign_zero(body_count, node_count);
+    m_with_curvature = true;
+    m_gradient = &gradient;
+    m_aim = nullptr;
+    m_first_touches.clear();
+    recall_forces();
+    list_near();
+    if (m_near.empty() && driven) return way;
+    make_model();
+    bool cut_more = false;
+    for (int listings = 0;;) {
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (m_zone.nodes[i].pinned) p.nodes[i] = m_zone.nodes[i].target - m_point.y.nodes[i];
+        if (!solve(p, way.newton_steps)) {
+            if (m_zone.nodes.empty()) {
+                if (!m_with_curvature) return way;
+                m_with_curvature = false;
+            } else {
+                if (!m_cut.more()) return way;
+                cut_more = true;
+            }
+            p.assign_zero(body_count, node_count);
+            make_model();
+            continue;
+        }
+        set_end(p, y_end);
+        if (listings < kMaxListings && !m_path.covers(y_end)) {
+            ++listings;
+            list_anew(y_end);
+            continue;
+        }
+        if (turns_too_far(p)) {
+            make_model();
+            continue;
+        }
+        if (add_missed(y_end)) {
+            keep_forces();
+            make_model();
+            continue;
+        }
+        break;
+    }
+    way.found = true;
+    if (!cut_more) m_cut.less();
+    keep_forces();
+
+    std::vector<Impact> impacts;
+    way.free = allowed_step(m_zone, m_point, y_end, &impacts);
+    Coordinates aim = p, best = y_end;
+    for (int halvings = 0; way.free < 1.0 && halvings <= kMaxHalvings; ++halvings) {
+        if (halvings > 0) {
+            // The shortened way, moved by the rows as little as possible in the metric of the model.
+            shorten_blocked(impacts, aim);
+            m_aim = &aim;
+            set_aim(aim);
+            p = aim;
+            set_end(p, y_end);
+            if (!m_path.covers(y_end)) list_anew(y_end);
+            allowed_step(m_zone, m_point, y_end, &impacts);
+        }
+        for (int round = 0; round < (m_first_touches.empty() ? kMaxRounds : kMaxFastRounds); ++round) {
+            linearise_at(y_end, impacts);
+            if (!solve(p, way.newton_steps)) {
+                if (!m_zone.nodes.empty() || !m_with_curvature) break;
+                m_with_curvature = false;
+                make_model();
+                if (m_aim != nullptr) set_aim(*m_aim);
+                linearise_at(y_end, impacts);
+                p.assign_zero(body_count, node_count);
+                if (!solve(p, way.newton_steps)) break;
+            }
+            set_end(p, y_end);
+            if (!m_path.covers(y_end)) list_anew(y_end);
+            const double free = allowed_step(m_zone, m_point, y_end, &impacts);
+            if (free > way.free) {
+                way.free = free;
+                best = y_end;
+                if (halvings == 0) keep_forces();
+            }
+            if (free == 1.0) break;
+        }
+    }
+    y_end = best;
+    for (int i = static_cast<int>(best.bodies.size()); i < m_zone.body_count(); ++i)  // joined on the way
+        y_end.bodies.push_back(m_zone.bodies[i].target);
+    return way;
+}
+
+// --- damping ----------------------------------------------------------------------------------------------------------
+
+void ModelDirection::damp(const ZonePoint& trial, double rise) {
+    std::vector<double> excess(trial.active.size());
+    double largest = 0.0, sum = 0.0;
+    for (std::size_t k = 0; k < trial.active.size(); ++k) {
+        const ActiveContact& active = trial.active[k];
+        const ZoneContact& contact = m_zone.contacts[active.index];
+        const double force = m_forces[active.index];
+        excess[k] = contact_energy(active.geometry, contact.range, contact.stiffness.value) -
+                    0.5 * force * force / contact.stiffness.value;
+        largest = std::max(largest, excess[k]);
+        sum += std::max(excess[k], 0.0);
+    }
+    // Where that does not explain the rise, all bodies are damped.
+    std::vector<char> marked(m_weight.size(), sum < 0.5 * rise ? 1 : 0);
+    for (std::size_t k = 0; k < trial.active.size(); ++k) {
+        if (!(excess[k] > kExcess * largest)) continue;
+        const ZoneContact& contact = m_zone.contacts[trial.active[k].index];
+        for (bool of_a : {true, false}) {
+            if (!of_a && contact.contact.with_ground()) continue;
+            if ((of_a ? contact.cloth_a : contact.cloth_b) >= 0) {
+                for (int n : feature_nodes(m_zone, contact, of_a))
+                    if (n >= 0) marked[static_cast<std::size_t>(m_zone.dynamic_count + n)] = 1;
+            } else if (m_zone.yields(of_a ? contact.a : contact.b)) {
+                marked[of_a ? contact.a : contact.b] = 1;
+            }
+        }
+    }
+    for (std::size_t i = 0; i < m_weight.size(); ++i)
+        if (marked[i]) m_weight[i] = std::max(kProximal, kMoreProximal * m_weight[i]);
+}
+
+void ModelDirection::relax() {
+    for (double& weight : m_weight) weight = weight > kProximal ? weight / kMoreProximal : 0.0;
+}
+
+}  // namespace diffsim

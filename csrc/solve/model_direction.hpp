@@ -1,0 +1,90 @@
+#pragma once
+
+#include "solve/contact_model.hpp"
+#include "solve/cut_search.hpp"
+#include "solve/zone_path.hpp"
+
+namespace diffsim {
+
+/// The direction of a zone far from its solution: the minimiser of one convex model of all near contacts, linearised again
+/// where it ends for as long as CCD does not let it go all the way. See docs/solver.md.
+///
+/// What it learns from model to model within a step: the contacts' forces, which give the next model its curvature and its first guess of
+/// who pushes, and which bodies need damping.
+class ModelDirection {
+public:
+    /// All of them are used for as long as this lives.
+    ModelDirection(Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system);
+
+    /// Begin with the forces at a point: those of the last step, where that is the start of this one.
+    void start_from(const ZonePoint& point);
+
+    struct Way {
+        bool found = false;    ///< false where rounding spoils the model's matrix
+        double free = 0.0;     ///< how much of the way to y_end is free for all that is listed
+        int newton_steps = 0;  ///< factorizations
+    };
+    /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts is
+    /// made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then, none is found:
+    /// a Newton step does as well.
+    Way find(const Coordinates& gradient, bool driven, Coordinates& y_end);
+
+    /// The energy at the trial is higher, by so much: damp the bodies whose contacts ask for it in the next model.
+    void damp(const ZonePoint& trial, double rise);
+    /// The way was good: less damping in the next model.
+    void relax();
+
+    /// Whether who pushes at the end of the way was known before the model was solved.
+    bool knew_who_pushes() const { return m_right_guess; }
+
+private:
+    /// A contact that has a row.
+    struct NearContact {
+        int contact;
+        ContactGeometry geometry;
+        double stiffness;  ///< of the row
+    };
+
+    void recall_forces();
+    void keep_forces();
+    void list_near();
+    void add_near(int index);
+    void add_near(int index, const ContactGeometry& geometry);
+    void sort_near();
+    void make_model();
+    void make_start_row(const NearContact& near);
+    bool solve(Coordinates& p, int& newton_steps);
+    bool turns_too_far(const Coordinates& p);
+    bool add_missed(const Coordinates& y_end);
+    void set_end(const Coordinates& p, Coordinates& y_end) const;
+    void set_aim(const Coordinates& aim);
+    void list_anew(Coordinates& y_end);
+    void add_row(const NearContact& near, const ContactGeometry& geometry);
+    void add_row_at_impact(const NearContact& near, double toi, const Coordinates& y_end);
+    void linearise_at(const Coordinates& y_end, const std::vector<Impact>& impacts);
+    void shorten_blocked(const std::vector<Impact>& impacts, Coordinates& p) const;
+
+    Zone& m_zone;
+    ZonePath& m_path;
+    ZonePoint& m_point;
+    BlockSystem& m_system;
+    ContactModel m_model;
+    ModelWorkspace m_work;
+    ZoneDerivatives m_smooth;
+    Placement m_at;                           // where the rows are linearised
+    const Coordinates* m_gradient = nullptr;  // the energy's
+    const Coordinates* m_aim = nullptr;       // of a shortened way
+    std::vector<double> m_row_force;          // of the last rows, per contact of the zone
+    bool m_with_curvature = true;             // in the model at hand
+    bool m_right_guess = false;               // the last model was solved by one factor
+    std::vector<NearContact> m_near;          // those with a row, in the order of the rows
+    std::vector<ContactRow> m_first_touches;  // rows of fast bodies at their times of impact
+    std::vector<PushingContact> m_pushing;
+    std::vector<double> m_forces;                    // of the last model, per contact of the zone
+    std::vector<std::pair<Contact, double>> m_kept;  // the same, by contact, across lists
+    int m_list = -1;                                 // the list that m_forces is of
+    std::vector<double> m_weight;                    // proximal, per body and node
+    CutSearch m_cut;                                 // of the elastic curvature
+};
+
+}  // namespace diffsim

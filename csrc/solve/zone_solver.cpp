@@ -1,0 +1,467 @@
+#include "solve/zone_solver.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+#include <utility>
+
+#include "parallel/interrupt.hpp"
+#include "solve/hard_contacts.hpp"
+#include "solve/model_direction.hpp"
+#include "solve/newton_direction.hpp"
+#include "solve/zone_path.hpp"
+#include "zone/zone_accuracy.hpp"
+
+namespace diffsim {
+namespace {
+
+constexpr double kArmijo = 1e-4;
+constexpr int kMaxHalvings = 50;
+constexpr int kMaxStalls = 3;            // steps in a row that get a driven body nowhere
+constexpr double kStall = 1e-3;          // of the way that is left
+constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
+constexpr int kMaxHardRounds = 50;
+constexpr double kNearSolution = 1e-4;  // residual below which the plain Newton step ends it
+constexpr int kMaxModelFactors = 1000;  // of a zone with cloth: from there on impacts just stop it
+constexpr double kGoodEnough = 1e3;     // times the tolerance: enough where rounding hides all further descent
+constexpr int kStagnantSteps = 6;       // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;        // without a lower energy: there is none to be found
+constexpr double kContraction = 0.1;    // of the residual: steps with an old factor that do less are not worth it
+constexpr double kHeld = 0.1;           // of the way to its target: a body that moved less is held by something
+constexpr double kShortWay = 0.1;       // of a body's radius
+
+/// State of one solve; the steps of solve_zone as members.
+class ZoneSolver {
+public:
+    ZoneSolver(
+        Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+        std::vector<Box>& visited)
+        : m_zone(zone),
+          m_options(options),
+          m_w(workspace),
+          m_visited(visited),
+          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
+
+    ZoneResult solve() {
+        start();
+        if (m_options.full_steps) {
+            take_full_steps(*m_options.full_steps);
+            return m_result;
+        }
+        if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
+        go_to_warm_start();
+        m_near =
+            m_zone.dynamic_count == 1 && m_zone.nodes.empty();  // a factor costs hardly more than the gradient alone
+        iterate();
+        if (m_zone.hard) harden();
+        return m_result;
+    }
+
+private:
+    Coordinates& y() { return m_w.point.y; }
+    bool is_one_body() const { return m_zone.dynamic_count == 1 && m_zone.nodes.empty(); }
+
+    // --- start -------------------------------------------------------------------------------------------------
+
+    void start() {
+        const std::size_t count = static_cast<std::size_t>(m_zone.dynamic_count);
+        m_zone.bodies.resize(count);  // those that do not yield join anew
+        m_w.point.y.assign_zero(count, m_zone.nodes.size());
+        m_w.y_end.resize(count, m_zone.nodes.size());
+        set_to_expected_ends(m_w.y_end);
+        m_path.list_contacts(m_w.y_end);
+        evaluate(m_zone, m_w.point);
+        bool rescue = false;  // some objects start the step below their floor
+        for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
+            const ContactRange& range = m_zone.contacts[k].range;
+            rescue = rescue || m_w.point.distances[k] < range.floor;
+            if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
+            m_result.status = ZoneStatus::bad_start;
+            m_result.worst_contact = static_cast<int>(k);
+            return;
+        }
+        if (rescue) m_path.rescue();
+        m_visited.assign(count + m_zone.cloths.size(), Box());
+        mark_visited();
+        if (is_one_body()) return;  // whose model is made if ever it is asked for, which at rest it is not
+        m_model.emplace(m_zone, m_path, m_w.point, m_w.system);
+        m_model->start_from(m_w.point);
+    }
+
+    /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that reach
+    /// to their targets would be full of neighbours that they never meet.
+    void set_to_expected_ends(Coordinates& y_end) const {
+        m_path.set_to_targets(y_end);
+        for (std::size_t i = 0; i < y_end.bodies.size(); ++i) {
+            const ZoneBody& body = m_zone.bodies[i];
+            const double radius = m_zone.mesh(static_cast<int>(i)).radius;
+            const auto extent = [&](const Vec6& y) { return y.tail<3>().norm() + radius * y.head<3>().norm(); };
+            const double falling = extent(body.target);
+            if (falling < kShortWay * radius && extent(body.warm) < kHeld * falling) y_end.bodies[i] = body.warm;
+        }
+    }
+
+    void mark_visited() {
+        for (int i = 0; i < m_zone.dynamic_count; ++i)
+            m_visited[i].include(transformed(m_zone.mesh(i).tree.nodes[0].box, m_w.point.poses[i]));
+        for (int c = 0; c < static_cast<int>(m_zone.cloths.size()); ++c) {
+            Box& box = m_visited[static_cast<std::size_t>(m_zone.dynamic_count + c)];
+            const int first = m_zone.cloths[c].first_node;
+            for (int i = first; i < first + m_zone.cloth(c).node_count(); ++i) box.include(m_w.point.nodes[i]);
+        }
+    }
+
+    /// Nothing touches on the way to the target and there: done without an iteration.
+    bool try_free_motion() {
+        m_w.y_end.bodies.resize(m_zone.bodies.size());
+        m_path.set_to_targets(m_w.y_end);
+        const bool touching = !m_w.point.active.empty();
+        if (touching && !may_pass(m_zone, m_w.y_end)) return false;
+        m_path.ensure_covered(m_w.y_end);
+        if ((m_zone.dynamic_count > 0 || !m_zone.elastic) &&
+            allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
+            m_result.fast_impacts = m_path.set_gates(m_w.y_end);
+            return false;
+        }
+        if (touching) return false;
+        if (!m_zone.cloths.empty() && m_zone.elastic) return false;
+        m_w.trial.y = m_w.y_end;
+        evaluate(m_zone, m_w.trial, &m_w.point);
+        if (!m_w.trial.active.empty()) return false;
+        accept_trial();
+        return true;
+    }
+
+    /// Last step's motion already respected last step's contacts: it is the natural first iterate.
+    void go_to_warm_start() {
+        m_w.y_end = y();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].warm;
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
+        if (largest_move() < kEpsilon * m_path.position()) return;
+        m_path.ensure_covered(m_w.y_end);
+        // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and
+        // descend from there to minimisers that no motion of that energy can reach.
+        const double step = m_path.clear_step(m_w.y_end, Clearance::landing);
+        if (step > 0.0 && m_w.trial.energy <= m_w.point.energy) accept_trial();
+    }
+
+    // --- moving ------------------------------------------------------------------------------------------------
+
+    void accept_trial() {
+        std::swap(m_w.point, m_w.trial);
+        mark_visited();
+    }
+
+    bool drives_done() const {
+        for (int i = m_zone.dynamic_count; i < m_zone.body_count(); ++i)
+            if (m_w.point.y.bodies[i] != m_zone.bodies[i].target) return false;
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (m_zone.nodes[i].pinned && m_w.point.y.nodes[i] != m_zone.nodes[i].target) return false;
+        return true;
+    }
+
+    // --- Newton ------------------------------------------------------------------------------------------------
+
+    /// Where nothing pushes, a contact within rounding of its rest distance may be found to push or not.
+    Accuracy current_accuracy() {
+        double& stiffness = m_w.derivatives.largest_stiffness;
+        for (std::size_t k = 0; m_w.point.active.empty() && k < m_zone.contacts.size(); ++k) {
+            const ZoneContact& contact = m_zone.contacts[k];
+            if (m_w.point.distances[k] > contact.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
+            for (int body : {contact.a, contact.b})
+                if (m_zone.yields(body))
+                    stiffness = std::max(stiffness, contact.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
+        }
+        return accuracy(m_zone, m_w.derivatives, m_path.position());
+    }
+    double current_noise() { return energy_noise(m_zone, m_w.point, m_w.system, m_path.position(), m_w.pushed); }
+
+    double slope(const Coordinates& gradient) const {
+        double sum = 0.0;
+        for (int i = 0; i < m_zone.dynamic_count; ++i)
+            sum += gradient.bodies[i].dot(m_w.y_end.bodies[i] - m_w.point.y.bodies[i]);
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            sum += gradient.nodes[i].dot(m_w.y_end.nodes[i] - m_w.point.y.nodes[i]);
+        return sum;
+    }
+
+    double largest_move() const {
+        double largest = 0.0;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) {
+            const Vec6 move = m_w.y_end.bodies[i] - m_w.point.y.bodies[i];
+            largest = std::max({largest, move.tail<3>().norm(), move.head<3>().norm() * m_zone.mesh(i).radius});
+        }
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            largest = std::max(largest, (m_w.y_end.nodes[i] - m_w.point.y.nodes[i]).norm());
+        return largest;
+    }
+
+    /// Backtrack along the way to y_end until the energy falls. At rest its fall drowns in rounding: there the slope
+    /// tells. False if no step does.
+    bool line_search(double first_step) {
+        m_trial_is_differentiated = false;
+        const double slope0 = slope(m_w.derivatives.gradient);
+        const double noise = current_noise();
+        double step = first_step;
+        for (int k = 0; k < kMaxHalvings && step > 0.0; ++k, step *= 0.5) {
+            if (step == 1.0)
+                m_w.trial.y = m_w.y_end;
+            else
+                m_path.set_trial(m_w.y_end, step);
+            if (step < 1.0 && k > 0 && allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr) < 1.0) continue;
+            evaluate(m_zone, m_w.trial, &m_w.point);
+            const double change = m_w.trial.energy - m_w.point.energy;
+            m_newton_full = step == 1.0;
+            if (change <= kArmijo * step * slope0) return true;
+            if (change <= noise) {
+                differentiate(m_zone, m_w.trial, Curvature::none, m_w.trial_derivatives, nullptr);
+                const double slope1 = std::abs(slope(m_w.trial_derivatives.gradient));
+                if (slope1 <= std::max(0.9 * std::abs(slope0), noise)) {
+                    m_trial_is_differentiated = true;
+                    return true;
+                }
+            }
+        }
+        return false;
+    }
+
+    /// Whether the gradient alone says that a Newton step reached the minimum, or came so near that further steps with
+    /// the factor at hand reach it. If so, takes the last of them past the tolerance: another factor would only show the
+    /// same. The gradient is worth its price where factors are dear, with cloth, and where the line search has it anyway.
+    bool finish_with_this_factor() {
+        const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
+        if (!m_newton.has_factor() || !(with_cloth || (m_newton.is_exact() && m_trial_is_differentiated))) return false;
+        const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
+        for (double before = m_result.residual;;) {
+            if (m_trial_is_differentiated)
+                std::swap(m_w.derivatives, m_w.trial_derivatives);
+            else
+                differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+            m_trial_is_differentiated = false;
+            m_w.derivatives.largest_stiffness = stiffness;
+            const Accuracy now = current_accuracy();
+            const bool done = now.residual < std::max(m_options.tolerance, now.floor);
+            if (!done && !(with_cloth && now.residual < kContraction * before)) return false;
+            if (!m_newton.repeat(m_zone, m_w.derivatives, m_w.system, m_w.step)) return false;
+            set_step_end();
+            m_result.residual = before = now.residual;
+            const bool moved = polish();
+            if (done) return true;
+            if (!moved) return false;
+        }
+    }
+
+    /// Where the Newton step ends.
+    void set_step_end() {
+        m_w.y_end = y();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] += m_w.step.bodies[i];
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] += m_w.step.nodes[i];
+    }
+
+    void iterate() {
+        int stalls = 0;
+        double best_residual = kInfinity;
+        int stagnant = 0;  // steps since the residual last halved
+        double lowest_energy = kInfinity;
+        int futile = 0;  // steps since it fell by more than rounding may do
+        for (;; ++m_result.iterations) {
+            if (m_options.interrupt != nullptr) m_options.interrupt->throw_if_asked();
+            const bool driven = drives_done();
+            if (m_result.iterations < m_options.max_iterations) {
+                const ModelStep step = take_model_step(driven, stalls);
+                if (step == ModelStep::blocked) return fail(ZoneStatus::blocked);
+                if (step == ModelStep::taken) continue;
+            }
+            if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
+                return fail(ZoneStatus::no_descent);
+            const Accuracy now = current_accuracy();
+            m_result.residual = now.residual;
+            if (driven && leave_saddle(now)) continue;
+            set_step_end();
+            const double rounding_step = 16.0 * kEpsilon * m_path.position();
+            if (driven && (now.residual < std::max(m_options.tolerance, now.floor) || largest_move() < rounding_step)) {
+                polish();
+                return;
+            }
+            if (m_near && m_result.iterations == 0 && now.residual > kNearSolution) {
+                m_near = false;
+                --m_result.iterations;
+                continue;
+            }
+            const double good = kGoodEnough * std::max(m_options.tolerance, now.floor);
+            stagnant = now.residual < 0.5 * best_residual ? 0 : stagnant + 1;
+            best_residual = std::min(best_residual, now.residual);
+            if (driven && stagnant >= kStagnantSteps && now.residual < good) return;
+            const bool lower = m_w.point.energy < lowest_energy - current_noise();
+            futile = driven && !lower ? futile + 1 : 0;
+            if (lower || !driven) lowest_energy = m_w.point.energy;
+            if (futile >= kFutileSteps) return fail(ZoneStatus::no_descent);
+            if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
+
+            // The step's end may lie where contacts have not been listed yet. New ones are beyond their rest distance
+            // here, so energy and derivatives stand.
+            m_path.ensure_covered(m_w.y_end);
+            double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
+            if (step < 1.0 || !m_path.gates_hold(m_w.y_end)) step = m_path.arc_step(m_w.y_end, step);
+            if (line_search(step)) {
+                m_near = m_newton.is_exact() && m_newton_full;
+                accept_trial();
+                const bool is_last = m_result.iterations + 1 >= m_options.max_iterations;
+                if (driven && !is_last && finish_with_this_factor()) {
+                    ++m_result.iterations;
+                    return;
+                }
+            } else if (driven) {
+                if (now.residual >= good) fail(ZoneStatus::no_descent);
+                return;
+            }
+        }
+    }
+
+    /// Near a point of balance that is a saddle of the energy, where descent hardly moves: go off it along negative curvature,
+    /// by the largest part of the contacts' range that lowers the energy. Once is enough: from there descent goes on.
+    bool leave_saddle(const Accuracy& now) {
+        if (m_left_saddle || !m_zone.nodes.empty() || m_newton.is_exact() || now.residual > kNearSolution) return false;
+        m_left_saddle = true;
+        const Coordinates newton_step = m_w.step;
+        if (m_newton.off_saddle(m_zone, m_w.derivatives, m_w.system, m_w.step) && follow_off_saddle()) return true;
+        m_w.step = newton_step;
+        return false;
+    }
+
+    /// Go along the direction in m_w.step. False where that lowers the energy nowhere.
+    bool follow_off_saddle() {
+        if (m_w.point.active.empty()) return false;
+        set_step_end();
+        double range = kInfinity;
+        for (const ActiveContact& active : m_w.point.active) {
+            const ContactRange& r = m_zone.contacts[active.index].range;
+            range = std::min(range, r.rest - r.floor);
+        }
+        const double scale = range / largest_move();
+        for (Vec6& s : m_w.step.bodies) s *= scale;
+        set_step_end();
+        m_path.ensure_covered(m_w.y_end);
+        if (!line_search(m_path.arc_step(m_w.y_end, 1.0))) return false;
+        accept_trial();
+        return true;
+    }
+
+    /// (M + dt² K) Δy = -dE/dy, so often. From y = 0 that is  (M + dt² K) v1 = M v0 + dt f  [Qiao et al. 2020, Eq. 3].
+    void take_full_steps(int count) {
+        for (int i = 0; i < m_zone.node_count(); ++i)
+            if (m_zone.nodes[i].pinned) y().nodes[i] = m_zone.nodes[i].target;
+        evaluate(m_zone, m_w.point);
+        for (m_result.iterations = 0; m_result.iterations < count; ++m_result.iterations) {
+            if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
+                return fail(ZoneStatus::no_descent);
+            m_w.trial.y = y();
+            for (int i = 0; i < m_zone.node_count(); ++i) m_w.trial.y.nodes[i] += m_w.step.nodes[i];
+            evaluate(m_zone, m_w.trial, &m_w.point);
+            if (!std::isfinite(m_w.trial.energy)) return fail(ZoneStatus::no_descent);
+            std::swap(m_w.point, m_w.trial);
+        }
+        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        m_result.residual = current_accuracy().residual;
+    }
+
+    /// Far from the solution: go where the model of all near contacts leads, the whole way.
+    enum class ModelStep { taken, near, blocked };
+    ModelStep take_model_step(bool driven, int& stalls) {
+        if ((m_near || m_model_factors > kMaxModelFactors) && driven) return ModelStep::near;
+        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        m_result.residual = current_accuracy().residual;
+        if (driven && m_result.residual < kNearSolution) return ModelStep::near;
+        m_newton.lose_factor();
+        if (!m_model) m_model.emplace(m_zone, m_path, m_w.point, m_w.system);
+        const ModelDirection::Way way = m_model->find(m_w.derivatives.gradient, driven, m_w.y_end);
+        if (!m_zone.nodes.empty()) m_model_factors += way.newton_steps;
+        if (!way.found) return ModelStep::near;
+        const double step = m_path.covered_step(m_w.y_end, way.free);
+        if (!driven) {
+            const DriveProgress progress = advance_drives(step, stalls);
+            if (progress == DriveProgress::blocked) return ModelStep::blocked;
+            if (progress == DriveProgress::moved) accept_trial();
+            return ModelStep::taken;
+        }
+        if (!(step > 0.0)) return ModelStep::near;
+        m_path.set_trial(m_w.y_end, step);
+        if (step == 1.0) m_w.trial.y = m_w.y_end;
+        evaluate(m_zone, m_w.trial, &m_w.point);
+        const double change = m_w.trial.energy - m_w.point.energy, noise = current_noise();
+        if (change > noise) {
+            // What rises with bodies is the contacts' energy, where rows are not true to them. Cloth buckles: a shorter step will do.
+            if (m_zone.nodes.empty() || !line_search(m_path.arc_step(m_w.y_end, 0.5 * step))) {
+                m_model->damp(m_w.trial, change);
+                return ModelStep::taken;
+            }
+        }
+        accept_trial();
+        m_model->relax();
+        m_near = change > -noise || (step == 1.0 && m_model->knew_who_pushes());
+        return ModelStep::taken;
+    }
+
+    /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
+    /// Where there is no room at all, what is in the way may make some in Newton steps of its own.
+    enum class DriveProgress { moved, waits, blocked };
+    DriveProgress advance_drives(double step, int& stalls) {
+        stalls = step < kStall ? stalls + 1 : 0;
+        if (stalls > kMaxStalls) return DriveProgress::blocked;
+        return step > 0.0 && m_path.clear_step(m_w.y_end) > 0.0 ? DriveProgress::moved : DriveProgress::waits;
+    }
+
+    /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel. False if there
+    /// is nothing to gain.
+    bool polish() {
+        if (m_w.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return false;
+        if (!m_path.covers(m_w.y_end)) return false;
+        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
+        m_w.trial.y = m_w.y_end;
+        evaluate(m_zone, m_w.trial, &m_w.point);
+        if (!(m_w.trial.energy <= m_w.point.energy + current_noise())) return false;
+        accept_trial();
+        return true;
+    }
+
+    /// Rounds of multipliers until hard contacts are at their rest distance.
+    void harden() {
+        for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
+            const double violation = HardContacts::violation(m_zone, m_w.point, m_path.position());
+            if (violation <= kHardTolerance) return;
+            if (round >= kMaxHardRounds) return fail(ZoneStatus::too_many_iterations);
+            m_hard.shift(m_zone, m_w.point, violation);
+            evaluate(m_zone, m_w.point);
+            iterate();
+        }
+    }
+
+    void fail(ZoneStatus status) { m_result.status = status; }
+
+    Zone& m_zone;
+    const ZoneOptions& m_options;
+    ZoneWorkspace& m_w;
+    std::vector<Box>& m_visited;
+    HardContacts m_hard;
+    ZonePath m_path;
+    std::optional<ModelDirection> m_model;  // made when first asked: most bodies at rest never do
+    NewtonDirection m_newton;
+    bool m_trial_is_differentiated = false;  // the one that the line search accepted
+    bool m_newton_full = false;              // the last line search took the whole step
+    int m_model_factors = 0;                 // of models with cloth so far
+    bool m_left_saddle = false;
+    bool m_near = false;  // the last model step was a Newton step: nothing that pushes changed
+    ZoneResult m_result;
+};
+
+}  // namespace
+
+ZoneResult solve_zone(
+    Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
+    std::vector<Box>& visited) {
+    return ZoneSolver(zone, passive, options, workspace, visited).solve();
+}
+
+}  // namespace diffsim

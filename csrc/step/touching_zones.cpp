@@ -1,0 +1,89 @@
+#include "step/touching_zones.hpp"
+
+#include <utility>
+
+namespace diffsim {
+namespace {
+
+/// From sizes to where each part begins; returns the sum.
+int to_offsets(std::vector<int>& sizes) {
+    int sum = 0;
+    for (int& size : sizes) sum += std::exchange(size, sum);
+    return sum;
+}
+
+}  // namespace
+
+std::size_t TouchingZones::bytes() const {
+    return contacts.capacity() * sizeof(Contact) + hard.capacity() * sizeof(HardContact) +
+           (bodies.capacity() + cloths.capacity() + body_end.capacity() + cloth_end.capacity() +
+            contact_end.capacity()) *
+               sizeof(int);
+}
+
+void ZoneFinder::find(
+    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_hard,
+    bool one_zone, TouchingZones& zones) {
+    const int object_count = model.body_count() + model.cloth_count();
+    const auto yields = [&](int object) {
+        return object >= 0 && (model.is_cloth(object) || model.bodies[object].is_dynamic());
+    };
+    const auto for_each_contact = [&](const auto& visit) {
+        for (const ContactList& list : lists)
+            for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list.hard[k]);
+    };
+
+    m_touching.reset(object_count);
+    m_zone_of.assign(static_cast<std::size_t>(object_count), -1);
+    for (int c = model.body_count(); c < object_count; ++c) m_zone_of[c] = 0;
+    if (one_zone) {
+        for (int i : movers) {
+            m_zone_of[i] = 0;
+            m_touching.unite(movers[0], i);
+        }
+    }
+    for_each_contact([&](const Contact& c, const HardContact&) {
+        if (yields(c.object_a)) m_zone_of[c.object_a] = 0;
+        if (yields(c.object_b)) m_zone_of[c.object_b] = 0;
+        if (yields(c.object_a) && yields(c.object_b)) m_touching.unite(c.object_a, c.object_b);
+    });
+
+    // Number the zones by their smallest objects, then sort objects and contacts by zone.
+    zones.body_end.clear();
+    zones.cloth_end.clear();
+    for (int i : movers) {
+        if (m_zone_of[i] < 0) continue;
+        const int root = m_touching.find(i);
+        if (root == i) {
+            m_zone_of[i] = zones.count();
+            zones.body_end.push_back(0);
+            zones.cloth_end.push_back(0);
+        } else {
+            m_zone_of[i] = m_zone_of[root];
+        }
+        ++(model.is_cloth(i) ? zones.cloth_end : zones.body_end)[m_zone_of[i]];
+    }
+    zones.contact_end.assign(zones.body_end.size(), 0);
+    const auto zone_of_contact = [&](const Contact& c) {
+        return m_zone_of[yields(c.object_a) ? c.object_a : c.object_b];
+    };
+    for_each_contact([&](const Contact& c, const HardContact&) { ++zones.contact_end[zone_of_contact(c)]; });
+    zones.bodies.resize(static_cast<std::size_t>(to_offsets(zones.body_end)));
+    zones.cloths.resize(static_cast<std::size_t>(to_offsets(zones.cloth_end)));
+    zones.contacts.resize(static_cast<std::size_t>(to_offsets(zones.contact_end)));
+    zones.hard.resize(with_hard ? zones.contacts.size() : 0);
+    for (int i : movers) {
+        if (m_zone_of[i] < 0) continue;
+        if (model.is_cloth(i))
+            zones.cloths[zones.cloth_end[m_zone_of[i]]++] = i - model.body_count();
+        else
+            zones.bodies[zones.body_end[m_zone_of[i]]++] = i;
+    }
+    for_each_contact([&](const Contact& c, const HardContact& hard) {
+        const int slot = zones.contact_end[zone_of_contact(c)]++;
+        zones.contacts[slot] = c;
+        if (with_hard) zones.hard[slot] = hard;
+    });
+}
+
+}  // namespace diffsim

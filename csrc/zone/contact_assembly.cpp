@@ -1,0 +1,281 @@
+#include "zone/contact_assembly.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+
+#include "math/positive_part.hpp"
+
+namespace diffsim {
+
+namespace {
+
+/// |L⁻¹ r|² of a body's part r of a row.
+double scaled_norm_sq(const ZoneBody& body, const Vec3& turn, const Vec3& shift) {
+    return turn.dot(body.inverse_inertia * turn) + shift.squaredNorm() / body.mass;
+}
+
+/// Adds up the contacts' derivatives along the bodies' twists and the nodes.
+class Assembler {
+public:
+    Assembler(
+        const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives,
+        BlockSystem* system)
+        : m_zone(zone),
+          m_point(point),
+          m_with_curvature(curvature != Curvature::dropped),
+          m_cut(cut),
+          m_derivatives(derivatives),
+          m_system(system) {}
+
+    void run() {
+        for (const ActiveContact& active : m_point.active) add(active.index, active.geometry);
+        end();
+    }
+
+    /// Contacts that push with forces of their own, instead of the active ones.
+    void run(const std::vector<PushingContact>& pushing) {
+        for (const PushingContact& contact : pushing) {
+            m_own_force = contact.force;
+            add(contact.index, *contact.geometry);
+        }
+        end();
+    }
+
+private:
+    void end() {
+        end_bodies();
+        end_ground();
+        m_derivatives.largest_force = std::max(m_derivatives.largest_force, std::sqrt(m_force_sq));
+        m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, std::sqrt(m_stiffness_sq));
+    }
+
+    /// Where the derivatives of a contact's side go.
+    struct BodyPlace {
+        int body;
+        BodySide side;
+    };
+    struct ClothPlace {
+        std::array<int, 3> nodes;
+        ClothSide side;
+    };
+
+    void add(int index, const ContactGeometry& geometry) {
+        const ZoneContact& contact = m_zone.contacts[index];
+        if (contact.contact.with_ground()) {
+            if (contact.cloth_a >= 0)
+                add_node_on_ground(contact, geometry);
+            else
+                add_body_on_ground(contact, geometry);
+        } else if (contact.cloth_a >= 0) {
+            add_pair(contact, geometry, cloth_on(contact, geometry, true), cloth_on(contact, geometry, false));
+        } else if (contact.cloth_b >= 0) {
+            add_pair(
+                contact, geometry, BodyPlace{contact.a, {m_point.poses[contact.a].t}},
+                cloth_on(contact, geometry, false));
+        } else {
+            add_bodies(contact, geometry);
+        }
+    }
+
+    ClothPlace cloth_on(const ZoneContact& contact, const ContactGeometry& geometry, bool of_a) const {
+        const Surface surface = of_a ? surface_a(m_zone, contact, m_point.poses, m_point.nodes)
+                                     : surface_b(m_zone, contact, m_point.poses, m_point.nodes);
+        return {feature_nodes(m_zone, contact, of_a), cloth_side(contact.contact, geometry, surface, of_a)};
+    }
+
+    void note_scale(double scale_sq, double force, double stiffness) {
+        m_force_sq = std::max(m_force_sq, force * force * scale_sq);
+        m_stiffness_sq = std::max(m_stiffness_sq, stiffness * stiffness * scale_sq);
+    }
+
+    // --- two bodies --------------------------------------------------------------------------------------------
+
+    /// Contacts of the same two bodies follow each other. They are added up along the bodies' relative motion.
+    void add_bodies(const ZoneContact& contact, const ContactGeometry& geometry) {
+        if (contact.a != m_a || contact.b != m_b) begin_bodies(contact);
+        const BodySide a{m_point.poses[m_a].t}, b{m_point.poses[m_b].t};
+        const ContactForce<9> d = m_own_force ? add_relative_curvature(geometry, *m_own_force, a, b, m_hessian)
+                                              : add_relative_derivatives(
+                                                    geometry, contact.range, contact.stiffness.value, a, b,
+                                                    m_with_curvature, m_system != nullptr ? &m_hessian : nullptr);
+        m_gradient += d.gradient;
+        const Vec3 shift = d.row.tail<3>();
+        if (m_zone.yields(m_a))
+            note_scale(scaled_norm_sq(m_zone.bodies[m_a], d.row.head<3>(), shift), d.force, d.stiffness);
+        if (m_zone.yields(m_b))
+            note_scale(scaled_norm_sq(m_zone.bodies[m_b], d.row.segment<3>(3), shift), d.force, d.stiffness);
+    }
+
+    void begin_bodies(const ZoneContact& contact) {
+        end_bodies();
+        m_a = contact.a;
+        m_b = contact.b;
+        m_pair = contact.pair;
+        m_stiffness = &contact.stiffness;
+        m_gradient.setZero();
+        m_hessian.set_zero();
+    }
+
+    void end_bodies() {
+        if (m_a == kNobody) return;
+        const bool a_yields = m_zone.yields(m_a), b_yields = m_zone.yields(m_b);
+        const Vector<12> gradient = both_twists(m_gradient);
+        if (a_yields) m_derivatives.gradient.bodies[m_a] += gradient.head<6>();
+        if (b_yields) m_derivatives.gradient.bodies[m_b] += gradient.tail<6>();
+        m_derivatives.body_contacts.push_back({m_a, m_b, *m_stiffness, gradient});
+        if (m_system != nullptr) {
+            Square<9> relative = m_hessian.whole();
+            if (a_yields && b_yields) cut_negative_part<9>(m_cut, relative);
+            const Square<12> hessian = both_twists(relative);
+            if (a_yields) add_diagonal(m_a, hessian.topLeftCorner<6, 6>(), a_yields && b_yields);
+            if (b_yields) add_diagonal(m_b, hessian.bottomRightCorner<6, 6>(), a_yields && b_yields);
+            if (a_yields && b_yields) {
+                if (m_a < m_b)
+                    m_system->off_diagonal(m_pair) += hessian.topRightCorner<6, 6>();
+                else
+                    m_system->off_diagonal(m_pair) += hessian.bottomLeftCorner<6, 6>();
+            }
+        }
+        m_a = m_b = kNobody;
+    }
+
+    void add_diagonal(int body, Mat6 block, bool is_cut) {
+        if (!is_cut) cut_negative_part<6>(m_cut, block);
+        m_system->diagonal(body) += block;
+    }
+
+    // --- cloth -------------------------------------------------------------------------------------------------
+
+    bool yields(const BodyPlace& place) const { return m_zone.yields(place.body); }
+    static bool yields(const ClothPlace&) { return true; }
+
+    void add_gradient(const BodyPlace& place, const Vec6& row, const Vec6& gradient, double force, double stiffness) {
+        m_derivatives.gradient.bodies[place.body] += gradient;
+        note_scale(scaled_norm_sq(m_zone.bodies[place.body], row.head<3>(), row.tail<3>()), force, stiffness);
+    }
+    void add_gradient(
+        const ClothPlace& place, const Vector<9>& row, const Vector<9>& gradient, double force, double stiffness) {
+        for (int k = 0; k < 3; ++k) {
+            const int node = place.nodes[k];
+            if (node < 0 || m_zone.nodes[node].pinned) continue;
+            m_derivatives.gradient.nodes[node] += gradient.segment<3>(3 * k);
+            note_scale(row.segment<3>(3 * k).squaredNorm() / m_zone.nodes[node].mass, force, stiffness);
+        }
+    }
+
+    void add_block(const BodyPlace& place, const Mat6& block) { m_system->diagonal(place.body) += block; }
+    void add_block(const ClothPlace& place, const Square<9>& block) {
+        for (int r = 0; r < 3; ++r)
+            for (int c = r; c < 3; ++c)
+                if (place.nodes[r] >= 0 && place.nodes[c] >= 0)
+                    add_node_block(m_zone, place.nodes[r], place.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
+    }
+    void add_cross(const BodyPlace& a, const ClothPlace& b, const Eigen::Matrix<double, 6, 9>& block) {
+        for (int k = 0; k < 3; ++k)
+            if (b.nodes[k] >= 0 && !m_zone.nodes[b.nodes[k]].pinned)
+                m_system->mixed_pair(m_system->find_mixed_pair(a.body, b.nodes[k])) += block.middleCols<3>(3 * k);
+    }
+    void add_cross(const ClothPlace& a, const ClothPlace& b, const Square<9>& block) {
+        for (int r = 0; r < 3; ++r)
+            for (int c = 0; c < 3; ++c)
+                if (a.nodes[r] >= 0 && b.nodes[c] >= 0)
+                    add_node_block(m_zone, a.nodes[r], b.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
+    }
+
+    template <class A>
+    void add_pair(const ZoneContact& contact, const ContactGeometry& geometry, const A& a, const ClothPlace& b) {
+        constexpr int kA = decltype(a.side)::kSize, kB = ClothSide::kSize;
+        ContactDerivatives<kA + kB> d = m_own_force ? contact_curvature(geometry, *m_own_force, a.side, b.side)
+                                                    : contact_derivatives(
+                                                          geometry, contact.range, contact.stiffness.value, a.side,
+                                                          b.side, m_system != nullptr, m_with_curvature);
+        if (yields(a)) add_gradient(a, d.row.template head<kA>(), d.gradient.template head<kA>(), d.force, d.stiffness);
+        add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
+        if (m_system == nullptr) return;
+        if (yields(a)) {
+            cut_negative_part<kA + kB>(m_cut, d.hessian);
+            add_block(a, d.hessian.template topLeftCorner<kA, kA>());
+            add_block(b, d.hessian.template bottomRightCorner<kB, kB>());
+            add_cross(a, b, d.hessian.template topRightCorner<kA, kB>());
+        } else {
+            Square<kB> hessian = d.hessian.template bottomRightCorner<kB, kB>();
+            cut_negative_part<kB>(m_cut, hessian);
+            add_block(b, hessian);
+        }
+    }
+
+    // --- ground ------------------------------------------------------------------------------------------------
+
+    void add_body_on_ground(const ZoneContact& contact, const ContactGeometry& geometry) {
+        if (contact.a != m_on_ground) {
+            end_ground();
+            m_on_ground = contact.a;
+            m_ground = {};
+            m_ground_stiffness = &contact.stiffness;
+        }
+        const Vec3 arm = geometry.closest.point_a - m_point.poses[contact.a].t;
+        if (m_own_force) return m_ground.add_force(*m_own_force, arm);
+        const PotentialValue d = m_ground.add(geometry.distance, arm, contact.range, contact.stiffness.value);
+        const ZoneBody& body = m_zone.bodies[contact.a];
+        const Vec3 turn = GroundContacts::row(arm).head<3>();
+        note_scale(turn.dot(body.inverse_inertia * turn) + 1.0 / body.mass, d.force, d.stiffness);
+    }
+
+    void end_ground() {
+        if (m_on_ground == kNobody) return;
+        Vector<12> gradient = Vector<12>::Zero();
+        gradient.head<6>() = m_ground.gradient();
+        m_derivatives.gradient.bodies[m_on_ground] += gradient.head<6>();
+        m_derivatives.body_contacts.push_back({m_on_ground, kGround, *m_ground_stiffness, gradient});
+        if (m_system != nullptr) {
+            Mat6 hessian = m_ground.hessian(m_with_curvature);
+            cut_negative_part<6>(m_cut, hessian);
+            m_system->diagonal(m_on_ground) += hessian;
+        }
+        m_on_ground = kNobody;
+    }
+
+    void add_node_on_ground(const ZoneContact& contact, const ContactGeometry& geometry) {
+        if (m_own_force) return;  // it has no curvature
+        const int node = feature_nodes(m_zone, contact, true)[0];
+        if (m_zone.nodes[node].pinned) return;
+        const PotentialValue potential = contact_potential(
+            contact.range.rest - geometry.distance, contact.range.rest - contact.range.pole, contact.stiffness.value);
+        m_derivatives.gradient.nodes[node].z() -= potential.force;
+        note_scale(1.0 / m_zone.nodes[node].mass, potential.force, potential.stiffness);
+        if (m_system != nullptr) m_system->node_diagonal(node)(2, 2) += potential.stiffness;
+    }
+
+    const Zone& m_zone;
+    const ZonePoint& m_point;
+    bool m_with_curvature;
+    CutShare m_cut;
+    ZoneDerivatives& m_derivatives;
+    BlockSystem* m_system;
+    std::optional<double> m_own_force;              // of the contact at hand
+    double m_force_sq = 0.0, m_stiffness_sq = 0.0;  // largest so far
+    int m_a = kNobody, m_b = kNobody, m_pair = -1;  // the two bodies at hand
+    Vector<9> m_gradient;
+    HalfSymmetric<9> m_hessian;
+    const ContactStiffness* m_stiffness = nullptr;
+    int m_on_ground = kNobody;  // the body at hand there
+    GroundContacts m_ground;
+    const ContactStiffness* m_ground_stiffness = nullptr;
+};
+
+}  // namespace
+
+void add_contact_derivatives(
+    const Zone& zone, const ZonePoint& point, Curvature curvature, CutShare cut, ZoneDerivatives& derivatives,
+    BlockSystem* system) {
+    Assembler(zone, point, curvature, cut, derivatives, system).run();
+}
+
+void add_contact_curvature(
+    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
+    ZoneDerivatives& derivatives, BlockSystem& system) {
+    Assembler(zone, point, Curvature::full, cut, derivatives, &system).run(pushing);
+}
+
+}  // namespace diffsim

@@ -1,0 +1,20 @@
+#pragma once
+
+#include "zone/zone.hpp"
+
+namespace diffsim {
+
+/// How far a point is from the minimum.
+struct Accuracy {
+    double residual;  ///< largest |L⁻¹ g| of a body or node, M = L Lᵀ, relative to the largest force
+    double floor;     ///< what rounding leaves of it
+};
+
+/// From derivatives with a Hessian. `position`: size of the numbers that distances are differences of [m].
+Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double position);
+
+/// What rounding can do to the energy. `system` holds the zone's last Hessian, `pushed` is scratch.
+double energy_noise(
+    const Zone& zone, const ZonePoint& point, const BlockSystem& system, double position, std::vector<double>& pushed);
+
+}  // namespace diffsim

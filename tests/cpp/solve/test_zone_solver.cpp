@@ -1,0 +1,80 @@
+#include "solve/zone_solver.hpp"
+
+#include <algorithm>
+
+#include "fixtures.hpp"
+
+using namespace diffsim;
+
+namespace {
+
+constexpr double kHalf = 0.05;       // edge of the cubes, half [m]
+constexpr double kThickness = 1e-4;  // [m]
+constexpr double kFall = 9.8e-4;     // of a step [m]
+constexpr double kGap = 3e-4;        // between the cubes: within reach of lists for the fall, out of it at rest [m]
+
+/// Two cubes of 1 kg side by side, that would fall if nothing held them.
+struct Cubes {
+    Model model;
+    std::vector<ClothParameters> materials;
+    PassiveBodies nobody;
+    ZoneWorkspace workspace;
+    std::vector<Box> visited;
+    Zone zone;
+
+    explicit Cubes(bool on_ground) {
+        model.thickness = kThickness;
+        if (on_ground) model.ground = {true, 0.0, 0.5 * kThickness};
+        const Vec3 half = Vec3::Constant(kHalf);
+        for (int i = 0; i < 2; ++i) model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
+        start_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        const double height = kHalf + kThickness * (1.0 - 1e-5);  // just touching
+        for (int i = 0; i < 2; ++i) {
+            const Pose pose{Mat3::Identity(), Vec3(i * (2.0 * kHalf + kGap), 0.0, height)};
+            zone.bodies.push_back(fixtures::zone_body(i, pose, 1.0, fixtures::box_inertia(half, 1.0)));
+            zone.bodies.back().target[5] = -kFall;
+        }
+        zone.dynamic_count = 2;
+    }
+    ZoneResult solve() { return solve_zone(zone, nobody, {}, workspace, visited); }
+    int listed_pairs() const {
+        return static_cast<int>(std::count_if(
+            zone.contacts.begin(), zone.contacts.end(), [](const ZoneContact& c) { return !c.contact.with_ground(); }));
+    }
+    int touching_pairs() const {
+        return static_cast<int>(std::count_if(
+            workspace.point.active.begin(), workspace.point.active.end(),
+            [&](const ActiveContact& a) { return !zone.contacts[a.index].contact.with_ground(); }));
+    }
+};
+
+}  // namespace
+
+TEST(bodies_held_by_something_list_no_neighbours_that_only_falling_would_bring_near) {
+    Cubes held(true);
+    CHECK(held.solve().status == ZoneStatus::converged);
+    CHECK(held.workspace.point.active.size() == 8);  // four vertices each, on the ground
+    CHECK(held.listed_pairs() == 0);
+
+    Cubes falling(true);
+    for (ZoneBody& body : falling.zone.bodies) body.warm[5] = -kFall;  // as if it had moved so far in the last step
+    CHECK(falling.solve().status == ZoneStatus::converged);
+    CHECK_NEAR(falling.workspace.point.y.bodies[0], held.workspace.point.y.bodies[0], 1e-12);
+}
+
+TEST(a_body_that_seems_held_meets_its_neighbour_all_the_same) {
+    // Pushed aside on the ground: three times the gap, which is short of a tenth of its radius.
+    Cubes pushed(true);
+    pushed.zone.bodies[0].target[3] = 3.0 * kGap;
+    CHECK(pushed.solve().status == ZoneStatus::converged);
+    CHECK(pushed.touching_pairs() > 0);
+    const Coordinates& y = pushed.workspace.point.y;
+    CHECK(y.bodies[0][3] > kGap);
+    CHECK(y.bodies[1][3] > 0.5 * kGap);  // the neighbour is taken along
+    for (const double distance : pushed.workspace.point.distances) CHECK(distance > 0.9 * 0.5 * kThickness);
+    // Without anything that holds it, too: it was at rest in the air.
+    Cubes released(false);
+    released.zone.bodies[0].target[3] = 3.0 * kGap;
+    CHECK(released.solve().status == ZoneStatus::converged);
+    CHECK(released.touching_pairs() > 0);
+}
