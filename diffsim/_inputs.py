@@ -13,6 +13,7 @@ from ._check import (
     CONTROL_FIELDS,
     STATE_FIELDS,
     check_control,
+    check_count,
     check_float_tensor,
     check_instance,
     check_shape,
@@ -31,16 +32,14 @@ _NOT_DRIVEN = (None,) * 6  # the controls, in the order of the operator
 def plain_inputs(
     state: Any,
     control: Any,
-    mass: Tensor,
-    inertia: Tensor,
-    gravity: Tensor,
+    parameters: Mapping[str, Tensor],
     state_shapes: tuple[torch.Size, torch.Size, torch.Size],
-    parameter_shapes: tuple[torch.Size, torch.Size, torch.Size],
+    parameter_shapes: Mapping[str, torch.Size],
 ) -> Inputs | None:
     """The operator's inputs in a scene without cloth if nothing has to be converted or complained about; else None.
 
     Kept fast: it is a good part of what a small step costs in Python. The shapes are those without a batch axis, of
-    position, orientation and nodes, and of mass, inertia and gravity.
+    position, orientation and nodes, and of the parameters.
     """
     if type(state) is not State:
         return None
@@ -48,13 +47,13 @@ def plain_inputs(
     vector, quaternion, nodes = state_shapes
     position, orientation = state.position, state.orientation
     velocity, angular_velocity = state.velocity, state.angular_velocity
+    mass, inertia, gravity = parameters["mass"], parameters["inertia"], parameters["gravity"]
     try:
         if position.shape != vector:
             if position.ndim != 3:
                 return None
             batch = position.shape[0]
             vector, quaternion, nodes = (torch.Size((batch, *shape)) for shape in state_shapes)
-        mass_shape, inertia_shape, gravity_shape = parameter_shapes
         if not (
             position.dtype is f64
             and orientation.dtype is f64
@@ -67,9 +66,9 @@ def plain_inputs(
             and orientation.shape == quaternion
             and velocity.shape == vector
             and angular_velocity.shape == vector
-            and mass.shape == mass_shape
-            and inertia.shape == inertia_shape
-            and gravity.shape == gravity_shape
+            and mass.shape == parameter_shapes["mass"]
+            and inertia.shape == parameter_shapes["inertia"]
+            and gravity.shape == parameter_shapes["gravity"]
             and position.is_cpu
             and orientation.is_cpu
             and velocity.is_cpu
@@ -219,6 +218,27 @@ def _stacked(
             column = [torch.zeros(count, 3, dtype=dtype, device="cpu") if t is None else t for t in column]
         stacked.append(torch.stack(torch.broadcast_tensors(*column)) if given else None)
     return stacked, any(t is not None for t in stacked), batch
+
+
+def checked_parameters(where: str, parameters: Any, shapes: Mapping[str, tuple[int, ...]]) -> Mapping[str, Tensor]:
+    """What is to take the place of parameters in a call: known names, tensors of the right shapes or batches of it."""
+    check_instance(where, "parameters", parameters, Mapping, "be a mapping of names to tensors or None")
+    batch: int | None = None
+    for name, value in parameters.items():
+        if name not in shapes:
+            raise ValueError(message(where, "parameters", f"have names among {', '.join(shapes)}", repr(name)))
+        label = f"parameters[{name!r}]"
+        batch = check_shape(where, label, check_float_tensor(where, label, value), shapes[name], batch)
+    return parameters  # type: ignore[no-any-return]
+
+
+def checked_steps(where: str, steps: Any, controls: Any) -> int:
+    """The number of steps of a rollout."""
+    if steps is None and isinstance(controls, Sequence):
+        steps = len(controls)
+    if steps is None:
+        raise TypeError(message(where, "steps", "be given, as in sim.rollout(state, steps=100)", None))
+    return check_count(where, "steps", steps)
 
 
 def _parameters(

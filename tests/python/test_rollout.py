@@ -43,6 +43,15 @@ def test_rollout_with_contact_is_repeated_stepping() -> None:
     assert_same(sim.rollout(state, None, 30), stepped(sim, state, [None] * 30))
 
 
+def test_controls_may_be_left_out_and_a_sequence_tells_the_number_of_steps(sim: ds.Simulator, state: ds.State) -> None:
+    expected = sim.rollout(state, None, 4)
+    assert_same(sim.rollout(state, steps=4), expected)
+    assert_same(sim.rollout(state, [ds.Control()] * 4), expected)
+    for controls in (None, ds.Control(), 4):
+        with pytest.raises(TypeError, match=r"rollout: steps must be given, as in sim.rollout\(state, steps=100\)"):
+            sim.rollout(state, controls)  # type: ignore[arg-type]
+
+
 def test_forms_of_controls_unbatched(sim: ds.Simulator, state: ds.State) -> None:
     forces = torch.randn(5, 2, 3, dtype=torch.float64)
     torque = torch.randn(2, 3, dtype=torch.float64)
