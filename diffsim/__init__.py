@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from . import diagnostics, rotation, shapes
+from . import diagnostics, parameters, rotation, shapes
 from ._units import UnitsWarning
 from .materials import ClothMaterial
 from .ops import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
@@ -26,6 +26,7 @@ __all__ = [
     "State",
     "UnitsWarning",
     "diagnostics",
+    "parameters",
     "rotation",
     "shapes",
 ]
