@@ -122,14 +122,12 @@ def check_placing(where: str, name: str, value: Any, width: int, state: State) -
     return tensor
 
 
-def check_control(
-    where: str, control: Any, dtype: torch.dtype, body_count: int, node_count: int, batch: int | None
-) -> int | None:
-    """The control fits the scene and the state's dtype and batch size. Returns the batch size known now."""
+def check_control(where: str, control: Any, body_count: int, node_count: int, batch: int | None) -> int | None:
+    """The control fits the scene and the state's batch size. Returns the batch size known now."""
     check_instance(where, "control", control, Control, "be a diffsim.Control or None")
     for name, value in control.__dict__.items():
         if value is not None:
-            tensor = check_float_tensor(where, f"control.{name}", value, dtype)
+            tensor = check_float_tensor(where, f"control.{name}", value)
             count = node_count if name.startswith("node") else body_count
             batch = check_shape(where, f"control.{name}", tensor, (count, 3), batch)
     return batch

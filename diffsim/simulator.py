@@ -22,8 +22,8 @@ from ._cloth_energy import cloth_elements
 from ._description import description
 from ._identity import SceneIdentity
 from ._inputs import (
+    CheckedInputs,
     Controls,
-    Inputs,
     check_unused,
     checked_inputs,
     checked_parameters,
@@ -258,8 +258,8 @@ class Simulator(SceneIdentity, Measurements):
 
         Args:
             state: Of one dtype, float32 or float64, with or without a batch axis (of size B) in front of any tensor.
-            control: Of the state's dtype, each tensor with or without a batch axis. Default: no forces, kinematic
-                bodies go on as they move, and pinned nodes stand still.
+            control: Each tensor float32 or float64, whatever the state is, with or without a batch axis. Default: no
+                forces, kinematic bodies go on as they move, and pinned nodes stand still.
             parameters: Takes the place of parameters of the module in this call, by their names: ``{"mass": m}``, each
                 float32 or float64, with or without a batch axis in front of its shape: one value per scene.
         Returns: The state one `dt` later, in the state's dtype; with a batch axis if any input has one.
@@ -271,15 +271,14 @@ class Simulator(SceneIdentity, Measurements):
         Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
         """
         values = self._values("Simulator", parameters)
-        inputs = None
+        inputs, single = None, False
         if not self._node_count:
             inputs = plain_inputs(state, control, values, self._state_shapes, self._parameter_shapes)
         if inputs is None:  # anything but float64 tensors in the plainest shapes
-            inputs, _ = self._checked_inputs("Simulator", state, control, None, values)
+            inputs, _, single = self._checked_inputs("Simulator", state, control, None, values)
         if self._check:
             self._check_unused_parameters(values)
         threads = self._num_threads or torch.get_num_threads()
-        single = state.position.dtype is torch.float32
         call = RolloutCall(self._model, self._options, 1, threads, single=single)
         outputs = rollout(call, *inputs)  # type: ignore[arg-type]
         result = state_from(outputs, state)
@@ -335,7 +334,7 @@ class Simulator(SceneIdentity, Measurements):
         if progress and checkpoint_every is None:
             length = max(1, steps // _PROGRESS_UPDATES)
         values = self._values(where, parameters)
-        inputs, has_time = self._checked_inputs(where, state, controls, steps, values)
+        inputs, has_time, single = self._checked_inputs(where, state, controls, steps, values)
         if self._check:
             self._check_unused_parameters(values)
         threads = self._num_threads or torch.get_num_threads()
@@ -354,7 +353,7 @@ class Simulator(SceneIdentity, Measurements):
                     keep_tape=checkpoint_every is None or steps <= every,
                     want_signature=want_signature,
                     first_step=start,
-                    single=state.dtype is torch.float32,
+                    single=single,
                 )
                 part = driven
                 if has_time and count < steps:
@@ -385,7 +384,7 @@ class Simulator(SceneIdentity, Measurements):
 
     def _checked_inputs(
         self, where: str, state: Any, controls: Any, steps: int | None, values: Mapping[str, Any] | None = None
-    ) -> tuple[Inputs, bool]:
+    ) -> CheckedInputs:
         values = self._values(where, None) if values is None else values
         parameters = {name: (values[name], self._parameter_shapes[name]) for name in (*PARAMETERS, *CLOTH_PARAMETERS)}
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)

@@ -275,8 +275,8 @@ class Control(_TensorFields):
 
     Rows of bodies and nodes a field says nothing to must be zero: a step refuses a control that it would not read.
 
-    Every tensor may carry one leading batch axis of its own. SI units, world frame, dtype of the state. Gradients reach
-    all of them.
+    Every tensor may carry one leading batch axis of its own, and be float32 or float64, whatever the state is: a step
+    is float64 inside. SI units, world frame. Gradients reach all of them, in the dtype they came in.
 
     Args:
         force: On dynamic bodies at the centre of mass [N], shape (..., n_bodies, 3), constant over the step.

@@ -132,7 +132,7 @@ def test_wrong_rollouts_are_named(sim: ds.Simulator, state: ds.State) -> None:
             ValueError,
             "controls.force must have shape (2, 3), (5, 2, 3) or (5, B, 2, 3), got (4, 2, 3)",
         ),
-        (ds.Control(force=zeros.float()), 4, {}, TypeError, "controls.force must have the dtype of the state"),
+        (ds.Control(force=zeros.half()), 4, {}, TypeError, "controls.force must have dtype torch.float32 or torch.fl"),
     ]
     for controls, steps, options, error, text in cases:
         with pytest.raises(error) as caught:
