@@ -117,19 +117,6 @@ Vector<A::kSize + B::kSize> relative_row(const A& a, const B& b, const Vec3& dir
     return row;
 }
 
-/// Orthonormal directions along which the closest point of an object slides, as many as its count says. On the border of
-/// a face the first runs along it.
-std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a) {
-    const ClosestPoints& points = geometry.closest;
-    const int count = of_a ? points.slide_count_a : points.slide_count_b;
-    if (count == 0) return {Vec3::Zero(), Vec3::Zero()};
-    const Vec3& edge = of_a ? points.edge_a : points.edge_b;
-    if (count == 1) return {edge.normalized(), Vec3::Zero()};
-    const bool on_border = (of_a ? points.border_count_a : points.border_count_b) == 1;
-    const Vec3 first = on_border ? Vec3(edge.normalized()) : geometry.normal.unitOrthogonal();
-    return {first, geometry.normal.cross(first)};
-}
-
 /// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|, of which a closest
 /// point has as many as its count. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is
 /// orthogonal to S and n:
@@ -258,6 +245,17 @@ Vec3 barycentric_rates(const Vec3& e1, const Vec3& e2, const Vec3& direction) {
 }
 
 }  // namespace
+
+std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a) {
+    const ClosestPoints& points = geometry.closest;
+    const int count = of_a ? points.slide_count_a : points.slide_count_b;
+    if (count == 0) return {Vec3::Zero(), Vec3::Zero()};
+    const Vec3& edge = of_a ? points.edge_a : points.edge_b;
+    if (count == 1) return {edge.normalized(), Vec3::Zero()};
+    const bool on_border = (of_a ? points.border_count_a : points.border_count_b) == 1;
+    const Vec3 first = on_border ? Vec3(edge.normalized()) : geometry.normal.unitOrthogonal();
+    return {first, geometry.normal.cross(first)};
+}
 
 ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, const Surface& cloth, bool of_a) {
     ClothSide side;

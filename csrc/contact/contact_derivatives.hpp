@@ -28,6 +28,10 @@ struct ClothSide {
 /// What a cloth's feature contributes to a contact: where on it the closest point lies.
 ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, const Surface& cloth, bool of_a);
 
+/// Orthonormal directions along which the closest point of an object slides, as many as its count says. On the border of
+/// a face the first runs along it.
+std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a);
+
 /// The energy's first derivative along the coordinates of a and of b, and what it is made of.
 template <int N>
 struct ContactForce {
