@@ -140,7 +140,8 @@ void add_contacts(
         if (!through_stiffness) continue;
         const double along = term.gradient.dot(motion);
         for (std::size_t s = 0; s < static_cast<std::size_t>(term.side_count); ++s) {
-            const double part = -along * (s == 0 ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b);
+            const double part =
+                -along * (s == 0 ? contact.law.stiffness.log_gradient_a : contact.law.stiffness.log_gradient_b);
             if (zone.yields(term.sides[s].body)) result.mass_gradient[term.sides[s].body] += part;
             for (int node : term.sides[s].nodes)
                 if (node >= 0) result.node_mass_gradient[node] += part;

@@ -47,9 +47,8 @@ private:
         ContactTerm& term) {
         term.sides[1].offset = A::kSize;
         const bool with_hessian = curvature != Curvature::none;
-        const auto d = contact_derivatives(
-            active.geometry, contact.range, contact.stiffness.value, a, b, with_hessian,
-            curvature != Curvature::dropped);
+        const auto d =
+            contact_derivatives(active.geometry, contact.law, a, b, with_hessian, curvature != Curvature::dropped);
         term.row = d.row;
         term.gradient = d.gradient;
         if (with_hessian) term.hessian = d.hessian;
@@ -59,17 +58,12 @@ private:
     void body_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
         term.sides[0].body = contact.a;
         term.row = GroundContacts::row(active.geometry.closest.point_a - m_point.poses[contact.a].t);
-        term.stiffness = contact_potential(
-                             contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
-                             contact.stiffness.value)
-                             .stiffness;
+        term.stiffness = normal_force(contact.law, active.geometry.distance).stiffness;
     }
 
     void node_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
         term.sides[0].nodes = feature_nodes(m_zone, contact, true);
-        const PotentialValue potential = contact_potential(
-            contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
-            contact.stiffness.value);
+        const PotentialValue potential = normal_force(contact.law, active.geometry.distance);
         term.row = Vec3::UnitZ();
         term.gradient = -potential.force * term.row;
         term.hessian = potential.stiffness * term.row * term.row.transpose();

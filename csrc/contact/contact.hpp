@@ -3,7 +3,7 @@
 #include <Eigen/Geometry>
 
 #include "collision/candidates.hpp"
-#include "contact/potential.hpp"
+#include "contact/law.hpp"
 #include "geometry/distance.hpp"
 #include "model/model.hpp"
 

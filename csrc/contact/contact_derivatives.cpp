@@ -303,10 +303,9 @@ Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, c
         motion_of(a, geometry.closest.point_a), motion_of(b, geometry.closest.point_b), geometry.normal);
 }
 
-double contact_energy(const ContactGeometry& geometry, const ContactRange& range, double stiffness) {
-    const double compression = range.rest - geometry.distance;
-    if (!(compression > 0.0)) return 0.0;
-    const double energy = contact_potential(compression, range.rest - range.pole, stiffness).energy;
+double contact_energy(const ContactGeometry& geometry, const ContactLaw& law) {
+    if (!(law.range.rest - geometry.distance > 0.0)) return 0.0;
+    const double energy = normal_force(law, geometry.distance).energy;
     if (geometry.sine_sq >= kParallelLimit) return energy;
     // Exactly parallel edges have no energy however close they are: vertex-patch pairs hold them apart.
     return geometry.sine_sq > 0.0 ? edge_mollifier(geometry.sine_sq).value * energy : 0.0;
@@ -317,13 +316,12 @@ namespace {
 /// The second derivative is added to `hessian`, unless that is null.
 template <class A, class B>
 ContactForce<A::kSize + B::kSize> derivatives_along(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
-    bool with_curvature, HalfSymmetric<A::kSize + B::kSize>* hessian) {
+    const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b, bool with_curvature,
+    HalfSymmetric<A::kSize + B::kSize>* hessian) {
     constexpr int kSize = A::kSize + B::kSize;
     ContactForce<kSize> result;
     result.row = relative_row(a, b, geometry.normal);
-    const PotentialValue potential =
-        contact_potential(range.rest - geometry.distance, range.rest - range.pole, stiffness);
+    const PotentialValue potential = normal_force(law, geometry.distance);
     const bool mollified = geometry.sine_sq < kParallelLimit;
     const Mollifier mollifier = mollified ? edge_mollifier(geometry.sine_sq) : Mollifier{1.0, 0.0, 0.0};
     result.force = mollifier.value * potential.force;
@@ -371,11 +369,11 @@ constexpr std::array<double, 4> kRelativeSign = {1.0, -1.0, 1.0, 1.0};
 }  // namespace
 
 ContactForce<9> add_relative_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
-    bool with_curvature, HalfSymmetric<9>* hessian) {
+    const ContactGeometry& geometry, const ContactLaw& law, const BodySide& a, const BodySide& b, bool with_curvature,
+    HalfSymmetric<9>* hessian) {
     return derivatives_along(
-        geometry, range, stiffness, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b),
-        with_curvature, hessian);
+        geometry, law, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b), with_curvature,
+        hessian);
 }
 
 ContactForce<9> add_relative_curvature(
@@ -413,13 +411,13 @@ Square<12> both_twists(const Square<9>& relative) {
 
 template <class A, class B>
 ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& side_a, const B& side_b,
-    bool with_hessian, bool with_curvature) {
+    const ContactGeometry& geometry, const ContactLaw& law, const A& side_a, const B& side_b, bool with_hessian,
+    bool with_curvature) {
     ContactDerivatives<A::kSize + B::kSize> result;
     if constexpr (std::is_same_v<A, BodySide> && std::is_same_v<B, BodySide>) {
         HalfSymmetric<9> hessian;
-        const ContactForce<9> relative = add_relative_derivatives(
-            geometry, range, stiffness, side_a, side_b, with_curvature, with_hessian ? &hessian : nullptr);
+        const ContactForce<9> relative =
+            add_relative_derivatives(geometry, law, side_a, side_b, with_curvature, with_hessian ? &hessian : nullptr);
         result.force = relative.force;
         result.stiffness = relative.stiffness;
         result.gradient = both_twists(relative.gradient);
@@ -428,8 +426,8 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     } else {
         HalfSymmetric<A::kSize + B::kSize> hessian;
         static_cast<ContactForce<A::kSize + B::kSize>&>(result) = derivatives_along(
-            geometry, range, stiffness, motion_of(side_a, geometry.closest.point_a),
-            motion_of(side_b, geometry.closest.point_b), with_curvature, with_hessian ? &hessian : nullptr);
+            geometry, law, motion_of(side_a, geometry.closest.point_a), motion_of(side_b, geometry.closest.point_b),
+            with_curvature, with_hessian ? &hessian : nullptr);
         if (with_hessian) result.hessian = hessian.whole();
     }
     return result;
@@ -441,8 +439,8 @@ Vec6 GroundContacts::row(const Vec3& arm) {
     return row;
 }
 
-PotentialValue GroundContacts::add(double height, const Vec3& arm, const ContactRange& range, double stiffness) {
-    const PotentialValue potential = contact_potential(range.rest - height, range.rest - range.pole, stiffness);
+PotentialValue GroundContacts::add(double height, const Vec3& arm, const ContactLaw& law) {
+    const PotentialValue potential = normal_force(law, height);
     m_force += potential.force;
     m_force_arm += potential.force * arm;
     const double k = potential.stiffness, kx = k * arm.x(), ky = k * arm.y();
@@ -478,7 +476,7 @@ Mat6 GroundContacts::hessian(bool with_curvature) const {
 #define DIFFSIM_INSTANTIATE(A, B)                                                                       \
     template Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry&, const A&, const B&); \
     template ContactDerivatives<A::kSize + B::kSize> contact_derivatives(                               \
-        const ContactGeometry&, const ContactRange&, double, const A&, const B&, bool, bool);
+        const ContactGeometry&, const ContactLaw&, const A&, const B&, bool, bool);
 DIFFSIM_INSTANTIATE(BodySide, BodySide)
 DIFFSIM_INSTANTIATE(BodySide, ClothSide)
 DIFFSIM_INSTANTIATE(ClothSide, ClothSide)

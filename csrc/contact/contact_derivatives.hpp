@@ -48,20 +48,20 @@ template <class A, class B>
 Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, const A& a, const B& b);
 
 /// Energy of a contact: mollifier times potential of the compression below the rest distance.
-double contact_energy(const ContactGeometry& geometry, const ContactRange& range, double stiffness);
+double contact_energy(const ContactGeometry& geometry, const ContactLaw& law);
 
 /// `with_curvature` false leaves the second derivative of distance and mollifier out of the Hessian, which is then
 /// stiffness * row rowᵀ. `with_hessian` false leaves the Hessian unset.
 template <class A, class B>
 ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
-    bool with_hessian, bool with_curvature);
+    const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b, bool with_hessian,
+    bool with_curvature);
 
 /// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. The second derivative is
 /// added to `hessian`, unless that is null.
 ContactForce<9> add_relative_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
-    bool with_curvature, HalfSymmetric<9>* hessian);
+    const ContactGeometry& geometry, const ContactLaw& law, const BodySide& a, const BodySide& b, bool with_curvature,
+    HalfSymmetric<9>* hessian);
 
 /// The same for a contact that pushes with a force of its own, whatever its distance, as a row of a ContactModel does: the second
 /// derivative is -force d²(distance).
@@ -81,7 +81,7 @@ public:
     /// Of the height, along the twist, for a vertex with this arm from the centre of mass.
     static Vec6 row(const Vec3& arm);
     /// One more vertex. Returns its energy with respect to its compression.
-    PotentialValue add(double height, const Vec3& arm, const ContactRange& range, double stiffness);
+    PotentialValue add(double height, const Vec3& arm, const ContactLaw& law);
 
     /// One that pushes with a force of its own.
     void add_force(double force, const Vec3& arm) {

@@ -22,8 +22,8 @@ bool HardContacts::Shifted::operator<(const Shifted& other) const {
 double HardContacts::violation(const Zone& zone, const ZonePoint& point, double position) {
     double violation = 0.0;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
-        const ContactRange& range = zone.contacts[k].range;
-        const double shift = zone.contacts[k].shift;
+        const ContactRange& range = zone.contacts[k].law.range;
+        const double shift = zone.contacts[k].law.shift;
         const double compression = std::max(range.rest - point.distances[k], 0.0);
         const double distance = std::abs(compression - shift);
         if (distance > 16.0 * kEpsilon * position)
@@ -40,14 +40,10 @@ void HardContacts::shift(Zone& zone, const ZonePoint& point, double violation) {
     m_shifted.clear();
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         ZoneContact& contact = zone.contacts[k];
-        ContactRange& range = contact.range;
-        const double force =
-            contact_potential(range.rest - point.distances[k], range.rest - range.pole, contact.stiffness.value).force;
-        contact.stiffness.value *= stiffening;
-        range.rest -= contact.shift;
-        contact.shift = hard_contact_shift(force, range.rest - range.pole, contact.stiffness.value);
-        range.rest += contact.shift;
-        if (contact.shift > 0.0) m_shifted.push_back({contact.contact, contact.shift});
+        const double force = normal_force(contact.law, point.distances[k]).force;
+        contact.law.stiffness.value *= stiffening;
+        shift_rest(contact.law, force);
+        if (contact.law.shift > 0.0) m_shifted.push_back({contact.contact, contact.law.shift});
     }
     std::sort(m_shifted.begin(), m_shifted.end());
 }
@@ -58,8 +54,8 @@ void HardContacts::restore(Zone& zone) const {
         const Shifted key{contact.contact, 0.0};
         const auto found = std::lower_bound(m_shifted.begin(), m_shifted.end(), key);
         if (found == m_shifted.end() || key < *found) continue;
-        contact.shift = found->shift;
-        contact.range.rest += found->shift;
+        contact.law.shift = found->shift;
+        contact.law.range.rest += found->shift;
     }
 }
 

@@ -70,7 +70,7 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
         gate.point_b = in_body(zone, b, y_b, geometry.closest.point_b);
         gate.normal = geometry.normal;
         const Passage start = passage(gate, zone, point.y);
-        gate.least_points = std::min(start.points, contact.range.rest) - passing;
+        gate.least_points = std::min(start.points, contact.law.range.rest) - passing;
         gate.least_centers = std::min(start.centers, geometry.normal.dot(pose_a.t - pose_b.t)) - 2.0 * passing;
         gate.fast = travel > kFastPart * radius;
         gates.push_back(gate);

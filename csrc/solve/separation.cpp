@@ -29,7 +29,7 @@ Vec3 outward(const CollisionMesh& mesh, const Pose& pose, int feature, bool is_p
 
 SignedGap signed_gap(const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, bool guess) {
     SignedGap result;
-    const double depth = contact.range.rest - contact.range.floor;
+    const double depth = contact.law.range.rest - contact.law.range.floor;
     if (contact.contact.with_ground() || geometry.distance > kWellDefined * depth)
         return {true, geometry.distance, geometry.normal};
     const Contact& c = contact.contact;
@@ -98,21 +98,22 @@ Separation separate(Zone zone, const PassiveBodies& passive) {
         for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
             const ZoneContact& contact = zone.contacts[k];
             ContactGeometry geometry = contact_geometry(zone, contact, at.poses, at.nodes);
-            const double depth = contact.range.rest - contact.range.floor;
-            if (!(geometry.distance < contact.range.rest - kAccepted * depth) || geometry.sine_sq == 0.0) continue;
+            const double depth = contact.law.range.rest - contact.law.range.floor;
+            if (!(geometry.distance < contact.law.range.rest - kAccepted * depth) || geometry.sine_sq == 0.0) continue;
             complete = false;
-            const double lack = (contact.range.rest - geometry.distance) / depth;
+            const double lack = (contact.law.range.rest - geometry.distance) / depth;
             if (lack > result.lack) {
                 result.worst = contact.contact;
                 result.distance = geometry.distance;
-                result.rest = contact.range.rest;
+                result.rest = contact.law.range.rest;
                 result.lack = lack;
             }
             const SignedGap gap = signed_gap(zone, contact, geometry, round >= kRoundsBeforeGuesses);
             if (!gap.valid) continue;
             geometry.normal = gap.normal;
             geometry.distance = gap.gap;
-            model.rows.push_back(make_row(zone, contact, geometry, at, begin, contact.range.rest + kClearance * depth));
+            model.rows.push_back(
+                make_row(zone, contact, geometry, at, begin, contact.law.range.rest + kClearance * depth));
             model.rows.back().range = depth;
             row_contacts.push_back(static_cast<int>(k));
         }

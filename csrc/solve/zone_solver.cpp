@@ -73,7 +73,7 @@ private:
         evaluate(m_zone, m_w.point);
         bool rescue = false;  // some objects start the step below their floor
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-            const ContactRange& range = m_zone.contacts[k].range;
+            const ContactRange& range = m_zone.contacts[k].law.range;
             rescue = rescue || m_w.point.distances[k] < range.floor;
             if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
             m_result.status = ZoneStatus::bad_start;
@@ -168,10 +168,10 @@ private:
         double& stiffness = m_w.derivatives.largest_stiffness;
         for (std::size_t k = 0; m_w.point.active.empty() && k < m_zone.contacts.size(); ++k) {
             const ZoneContact& contact = m_zone.contacts[k];
-            if (m_w.point.distances[k] > contact.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
+            if (m_w.point.distances[k] > contact.law.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
             for (int body : {contact.a, contact.b})
                 if (m_zone.yields(body))
-                    stiffness = std::max(stiffness, contact.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
+                    stiffness = std::max(stiffness, contact.law.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
         }
         return accuracy(m_zone, m_w.derivatives, m_path.position());
     }
@@ -337,7 +337,7 @@ private:
         set_step_end();
         double range = kInfinity;
         for (const ActiveContact& active : m_w.point.active) {
-            const ContactRange& r = m_zone.contacts[active.index].range;
+            const ContactRange& r = m_zone.contacts[active.index].law.range;
             range = std::min(range, r.rest - r.floor);
         }
         const double scale = range / largest_move();

@@ -25,7 +25,7 @@ void RecordedZones::rebuild(int index, ZoneMemory& memory, std::vector<int>& loc
     evaluate(zone, point);
     bool below_floor = false;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k)
-        below_floor = below_floor || point.distances[k] < zone.contacts[k].range.floor;
+        below_floor = below_floor || point.distances[k] < zone.contacts[k].law.range.floor;
     if (below_floor) {
         rescue_contacts(zone);
         evaluate(zone, point);
@@ -92,8 +92,8 @@ void RecordedZones::list_contacts(
         add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
         ZoneContact& entry = zone.contacts.back();
         if (zone.hard) {
-            entry.shift = m_record.zones.hard[c].shift;
-            entry.range.rest += entry.shift;
+            entry.law.shift = m_record.zones.hard[c].shift;
+            entry.law.range.rest += entry.law.shift;
         }
         if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
         const std::pair<int, int> pair(std::min(entry.a, entry.b), std::max(entry.a, entry.b));

@@ -407,9 +407,9 @@ private:
             const ZoneContact& contact = zone.contacts[active.index];
             const Contact& c = contact.contact;
             results.contacts.push_back(c);
-            results.hard.push_back({contact.shift, zone.compliance});
-            outcome.max_compression =
-                std::max(outcome.max_compression, contact.range.rest - contact.shift - active.geometry.distance);
+            results.hard.push_back({contact.law.shift, zone.compliance});
+            outcome.max_compression = std::max(
+                outcome.max_compression, contact.law.range.rest - contact.law.shift - active.geometry.distance);
             std::uint64_t& hash = outcome.signature;
             hash = mix(hash, pack(c.object_a, static_cast<std::uint32_t>(c.object_b)));
             hash = mix(hash, pack(c.feature_a, static_cast<std::uint32_t>(c.feature_b)));
@@ -422,7 +422,7 @@ private:
         throw PenetratingStart(
             "state: '" + m_model.name(contact.contact.object_a) + "' and '" + m_model.name(contact.contact.object_b) +
                 "' penetrate: their meshes are " + number(distance) + " m apart, where at rest they keep " +
-                number(contact.range.rest) + " m; move them apart, for instance with sim.separate(state)",
+                number(contact.law.range.rest) + " m; move them apart, for instance with sim.separate(state)",
             contact.contact.object_a, contact.contact.object_b);
     }
 

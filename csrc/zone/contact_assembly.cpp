@@ -97,8 +97,8 @@ private:
         const BodySide a{m_point.poses[m_a].t}, b{m_point.poses[m_b].t};
         const ContactForce<9> d = m_own_force ? add_relative_curvature(geometry, *m_own_force, a, b, m_hessian)
                                               : add_relative_derivatives(
-                                                    geometry, contact.range, contact.stiffness.value, a, b,
-                                                    m_with_curvature, m_system != nullptr ? &m_hessian : nullptr);
+                                                    geometry, contact.law, a, b, m_with_curvature,
+                                                    m_system != nullptr ? &m_hessian : nullptr);
         m_gradient += d.gradient;
         const Vec3 shift = d.row.tail<3>();
         if (m_zone.yields(m_a))
@@ -112,7 +112,7 @@ private:
         m_a = contact.a;
         m_b = contact.b;
         m_pair = contact.pair;
-        m_stiffness = &contact.stiffness;
+        m_stiffness = &contact.law.stiffness;
         m_gradient.setZero();
         m_hessian.set_zero();
     }
@@ -186,10 +186,10 @@ private:
     template <class A>
     void add_pair(const ZoneContact& contact, const ContactGeometry& geometry, const A& a, const ClothPlace& b) {
         constexpr int kA = decltype(a.side)::kSize, kB = ClothSide::kSize;
-        ContactDerivatives<kA + kB> d = m_own_force ? contact_curvature(geometry, *m_own_force, a.side, b.side)
-                                                    : contact_derivatives(
-                                                          geometry, contact.range, contact.stiffness.value, a.side,
-                                                          b.side, m_system != nullptr, m_with_curvature);
+        ContactDerivatives<kA + kB> d =
+            m_own_force
+                ? contact_curvature(geometry, *m_own_force, a.side, b.side)
+                : contact_derivatives(geometry, contact.law, a.side, b.side, m_system != nullptr, m_with_curvature);
         if (yields(a)) add_gradient(a, d.row.template head<kA>(), d.gradient.template head<kA>(), d.force, d.stiffness);
         add_gradient(b, d.row.template tail<kB>(), d.gradient.template tail<kB>(), d.force, d.stiffness);
         if (m_system == nullptr) return;
@@ -212,11 +212,11 @@ private:
             end_ground();
             m_on_ground = contact.a;
             m_ground = {};
-            m_ground_stiffness = &contact.stiffness;
+            m_ground_stiffness = &contact.law.stiffness;
         }
         const Vec3 arm = geometry.closest.point_a - m_point.poses[contact.a].t;
         if (m_own_force) return m_ground.add_force(*m_own_force, arm);
-        const PotentialValue d = m_ground.add(geometry.distance, arm, contact.range, contact.stiffness.value);
+        const PotentialValue d = m_ground.add(geometry.distance, arm, contact.law);
         const ZoneBody& body = m_zone.bodies[contact.a];
         const Vec3 turn = GroundContacts::row(arm).head<3>();
         note_scale(turn.dot(body.inverse_inertia * turn) + 1.0 / body.mass, d.force, d.stiffness);
@@ -240,8 +240,7 @@ private:
         if (m_own_force) return;  // it has no curvature
         const int node = feature_nodes(m_zone, contact, true)[0];
         if (m_zone.nodes[node].pinned) return;
-        const PotentialValue potential = contact_potential(
-            contact.range.rest - geometry.distance, contact.range.rest - contact.range.pole, contact.stiffness.value);
+        const PotentialValue potential = normal_force(contact.law, geometry.distance);
         m_derivatives.gradient.nodes[node].z() -= potential.force;
         note_scale(1.0 / m_zone.nodes[node].mass, potential.force, potential.stiffness);
         if (m_system != nullptr) m_system->node_diagonal(node)(2, 2) += potential.stiffness;

@@ -9,7 +9,7 @@ ContactRow make_row(
     const Coordinates& y_now, double wanted) {
     ContactRow row;
     row.pair = contact.pair;
-    row.stiffness = contact.stiffness.value;
+    row.stiffness = contact.law.stiffness.value;
     row.missing = wanted - geometry.distance;
     row.relative.tail<3>() = -geometry.normal;
     const auto add_body = [&](int body, const Vec3& point, const Vec3& normal, int& slot, int turn) {

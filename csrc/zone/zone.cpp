@@ -174,7 +174,7 @@ void rescue_contacts(Zone& zone) {
     for (const ZoneBody& body : zone.bodies) poses.push_back(body.start);
     for (const ZoneNode& node : zone.nodes) nodes.push_back(node.start);
     for (ZoneContact& contact : zone.contacts) {
-        contact.range = rescued_range(contact.range, contact_geometry(zone, contact, poses, nodes).distance);
+        contact.law.range = rescued_range(contact.law.range, contact_geometry(zone, contact, poses, nodes).distance);
     }
 }
 
@@ -262,7 +262,7 @@ void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
         const ZoneContact& contact = zone.contacts[k];
         if (motion) {
             const double at_least = before->distances[k] - motion->approach(contact);
-            if (at_least > contact.range.rest) {
+            if (at_least > contact.law.range.rest) {
                 point.distances[k] = at_least;
                 continue;
             }
@@ -273,7 +273,7 @@ void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
             const double height = pose.R.row(2).dot(zone.mesh(contact.a).vertices[contact.contact.feature_a]) +
                                   pose.t.z() - zone.ground_height;
             point.distances[k] = height;
-            if (!(height < contact.range.rest)) continue;
+            if (!(height < contact.law.range.rest)) continue;
         }
         const Surface a = body_on_ground ? surface_a(zone, contact, point.poses, point.nodes)
                                          : placed_surface(zone, contact, point, true);
@@ -282,8 +282,8 @@ void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
         const ContactGeometry& geometry =
             point.active.emplace_back(static_cast<int>(k), contact.contact, a, b, zone.ground_height).geometry;
         point.distances[k] = geometry.distance;
-        if (geometry.distance < contact.range.rest)
-            point.contact_energy += contact_energy(geometry, contact.range, contact.stiffness.value);
+        if (geometry.distance < contact.law.range.rest)
+            point.contact_energy += contact_energy(geometry, contact.law);
         else
             point.active.pop_back();
     }

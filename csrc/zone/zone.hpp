@@ -73,9 +73,7 @@ struct ZoneContact {
     int a, b;                        ///< indices into Zone::bodies, kNobody for cloth; b is kGround with the ground
     int cloth_a = -1, cloth_b = -1;  ///< indices into Zone::cloths, -1 for others
     int pair;                        ///< block of the Hessian where two bodies yield, or -1
-    ContactRange range;
-    ContactStiffness stiffness;
-    double shift = 0.0;  ///< of range.rest, so that a hard contact's force acts at its rest distance [m]
+    ContactLaw law;
 };
 
 /// The vertices of bodies in features of their contacts with other objects. Most are in several: each is placed once.

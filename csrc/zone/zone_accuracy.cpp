@@ -42,9 +42,7 @@ double energy_noise(
     for (const ActiveContact& active : point.active) {
         if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
         const ZoneContact& contact = zone.contacts[active.index];
-        const double pole = contact.range.rest - contact.range.pole;
-        const double force =
-            contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
+        const double force = normal_force(contact.law, active.geometry.distance).force;
         const bool yields_a = zone.yields(contact.a), yields_b = zone.yields(contact.b);
         if (yields_a) pushed[contact.a] += force;
         if (yields_b) pushed[contact.b] += force;

@@ -119,13 +119,13 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
     entry.cloth_a = a.cloth;
     entry.cloth_b = b.cloth;
     entry.pair = -1;
-    entry.range = contact_range(
+    entry.law.range = contact_range(
         contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
     const double mass_a = a.cloth >= 0 ? feature_mass(zone, entry, true) : zone.bodies[a.body].mass;
     const double mass_b = b.cloth >= 0        ? feature_mass(zone, entry, false)
                           : b.body == kGround ? kInfinity
                                               : zone.bodies[b.body].mass;
-    entry.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
+    entry.law.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
     zone.contacts.push_back(entry);
     list_feature_vertices(zone, entry);
 }
@@ -354,11 +354,12 @@ double allowed_step(
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
         // A pair that is already nearer than the floor may use up most of what is left above the pole.
-        const double room = point.distances[k] - contact.range.pole;
+        const double room = point.distances[k] - contact.law.range.pole;
         CcdOptions ccd;
-        const double wanted = clearance == Clearance::floor ? contact.range.floor : contact.range.landing;
-        const double keep = std::min(wanted - contact.range.pole, (clearance == Clearance::floor ? 0.1 : 0.8) * room);
-        ccd.min_distance = contact.range.pole + keep;
+        const double wanted = clearance == Clearance::floor ? contact.law.range.floor : contact.law.range.landing;
+        const double keep =
+            std::min(wanted - contact.law.range.pole, (clearance == Clearance::floor ? 0.1 : 0.8) * room);
+        ccd.min_distance = contact.law.range.pole + keep;
         ccd.tolerance = 0.2 * keep;
         if (impacts == nullptr) ccd.until = step;
         if (ccd.until * motion.approach(contact) < room - 1.2 * keep) continue;

@@ -43,10 +43,11 @@ struct Situation {
         other.b = moved(b, x.tail<6>());
         return other;
     }
+    ContactLaw law() const { return {range, {kStiffness, 0.0, 0.0}}; }
     ContactGeometry geometry() const { return contact_geometry(model, contact, a, b, 0.0); }
-    double energy() const { return contact_energy(geometry(), range, kStiffness); }
+    double energy() const { return contact_energy(geometry(), law()); }
     ContactDerivatives<12> derivatives(bool with_curvature = true) const {
-        return contact_derivatives(geometry(), range, kStiffness, BodySide{a.t}, BodySide{b.t}, true, with_curvature);
+        return contact_derivatives(geometry(), law(), BodySide{a.t}, BodySide{b.t}, true, with_curvature);
     }
     /// Gradient in the chart of the poses from which x counts: a turn's is Jᵀ of that along the twist at x.
     VectorX gradient(const VectorX& x) const {
@@ -316,7 +317,7 @@ TEST(exactly_parallel_edges_resist_turning) {
 TEST(ground_derivatives_agree_with_differences) {
     const Model model = two_bodies();
     check::Random random(5);
-    const ContactRange range{2.0, 2.0, -2.0, -2.0, -2.0};
+    const ContactLaw law{{2.0, 2.0, -2.0, -2.0, -2.0}, {kStiffness, 0.0, 0.0}};
     constexpr std::array<int, 3> kVertices = {3, 0, 1};
     for (int k = 0; k < 10; ++k) {
         NOTE(k);
@@ -332,7 +333,7 @@ TEST(ground_derivatives_agree_with_differences) {
             GroundContacts result;
             for (const int vertex : kVertices) {
                 const ContactGeometry g = at(x, vertex);
-                result.add(g.distance, g.closest.point_a - center(x), range, kStiffness);
+                result.add(g.distance, g.closest.point_a - center(x), law);
             }
             return result;
         };
@@ -343,7 +344,7 @@ TEST(ground_derivatives_agree_with_differences) {
         };
         const auto energy = [&](const VectorX& x) {
             double sum = 0.0;
-            for (const int vertex : kVertices) sum += contact_energy(at(x, vertex), range, kStiffness);
+            for (const int vertex : kVertices) sum += contact_energy(at(x, vertex), law);
             return sum;
         };
         const VectorX zero = VectorX::Zero(6), g = gradient(zero);
@@ -352,8 +353,7 @@ TEST(ground_derivatives_agree_with_differences) {
         for (const int vertex : kVertices) {
             const ContactGeometry geometry = at(zero, vertex);
             const Vec6 row = GroundContacts::row(geometry.closest.point_a - pose.t);
-            rows += contact_potential(range.rest - geometry.distance, range.rest - range.pole, kStiffness).stiffness *
-                    row * row.transpose();
+            rows += normal_force(law, geometry.distance).stiffness * row * row.transpose();
         }
         CHECK(g.head<3>().norm() > 1e-3);
         CHECK_NEAR(g, fixtures::numeric_gradient(energy, zero, kStep), kDifferences * g.norm());

@@ -40,8 +40,8 @@ void add_contact(Zone& zone, int a, int b, ContactType type, int feature_a, int 
     contact.pair = -1;
     for (int k = 0; k < static_cast<int>(zone.pairs.size()); ++k)
         if (zone.pairs[k] == std::pair(std::min(a, b), std::max(a, b))) contact.pair = k;
-    contact.range = contact_range(kThickness, kThickness);
-    contact.stiffness = {10.0, 0.0, 0.0};
+    contact.law.range = contact_range(kThickness, kThickness);
+    contact.law.stiffness = {10.0, 0.0, 0.0};
     zone.contacts.push_back(contact);
     list_feature_vertices(zone, contact);
 }
@@ -224,8 +224,7 @@ TEST(dropped_curvature_leaves_mass_and_rows) {
             const bool ground = contact.contact.with_ground();
             const Vec3 center_b = ground ? Vec3(Vec3::Zero()) : point.poses[contact.b].t;
             const auto d = contact_derivatives(
-                active.geometry, contact.range, contact.stiffness.value, BodySide{point.poses[contact.a].t},
-                BodySide{center_b}, true, false);
+                active.geometry, contact.law, BodySide{point.poses[contact.a].t}, BodySide{center_b}, true, false);
             VectorX row = VectorX::Zero(18);
             if (contact.a < 3)
                 row.segment<6>(6 * contact.a) = chart_jacobian(y.bodies[contact.a]).transpose() * d.row.head<6>();

@@ -83,7 +83,7 @@ Case random_case(const Room& room, check::Random& random) {
     ContactCoverage coverage;
     collect_contacts(zone, passive, begin, end, coverage);
     c.y = end;
-    for (ZoneContact& contact : zone.contacts) contact.stiffness = {10.0, 0.0, 0.0};
+    for (ZoneContact& contact : zone.contacts) contact.law.stiffness = {10.0, 0.0, 0.0};
     return c;
 }
 
@@ -125,7 +125,7 @@ bool is_stable(const Zone& zone, const Coordinates& y) {
     const ZonePoint here = point_at(zone, y, VectorX::Zero(size));
     if (here.energy == kInfinity) return false;
     for (const ActiveContact& active : here.active) {
-        const ContactRange& range = zone.contacts[active.index].range;
+        const ContactRange& range = zone.contacts[active.index].law.range;
         if (active.geometry.distance < range.pole + 0.15 * (range.rest - range.pole)) return false;
     }
     for (Eigen::Index i = 0; i < size; ++i)
@@ -289,10 +289,7 @@ TEST(dropped_curvature_leaves_mass_elasticity_and_rows) {
                 else
                     add_body(contact.b, g.closest.point_b, -g.normal);
             }
-            double stiffness =
-                contact_potential(
-                    contact.range.rest - g.distance, contact.range.rest - contact.range.pole, contact.stiffness.value)
-                    .stiffness;
+            double stiffness = normal_force(contact.law, g.distance).stiffness;
             if (g.sine_sq < kParallelLimit) stiffness *= edge_mollifier(g.sine_sq).value;
             expected += stiffness * row(rows) * row(rows).transpose();
         }
