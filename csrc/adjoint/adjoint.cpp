@@ -7,6 +7,7 @@
 #include "adjoint/contact_term.hpp"
 #include "adjoint/linearised_zone.hpp"
 #include "math/rotation.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
@@ -113,10 +114,9 @@ void add_contacts(
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
-        const bool of_bodies = zone.yields(contact.a) && (contact.contact.with_ground() || zone.yields(contact.b));
-        const bool with_place = needs.place && !of_bodies;
+        const bool with_place = needs.place && !is_of_yielding_bodies(zone, contact);
         // A hard contact's stiffness is only how its multiplier was found.
-        const bool through_stiffness = needs.mass && !zone.hard && (contact.cloth_a >= 0 || contact.cloth_b >= 0);
+        const bool through_stiffness = needs.mass && !zone.hard && contact.has_cloth();
         if (!with_place && !through_stiffness) continue;
         const ContactTerm term =
             contact_term(zone, point, active, with_place && multipliers == nullptr ? Curvature::full : Curvature::none);

@@ -1,32 +1,11 @@
 #pragma once
 
-#include "contact/contact.hpp"
+#include "contact/sides.hpp"
 #include "math/half_symmetric.hpp"
 
-/// Derivatives of a contact's energy.
-///
-/// Of a rigid body they are taken along its twist at its current pose, (turn, shift): a turn phi moves
-/// x -> Exp(phi) (x - t) + t about the centre of mass t. Second derivatives are those of this chart at phi = 0, hence
-/// symmetric. Of cloth they are taken along the three nodes of a feature; an edge and a vertex use the first two and
-/// the first.
+/// Derivatives of a contact's energy along the coordinates of its two sides. Second derivatives of a body are those of its
+/// twist's chart at phi = 0, hence symmetric.
 namespace diffsim {
-
-/// A contact on a rigid body.
-struct BodySide {
-    static constexpr int kSize = 6;
-    Vec3 center;  ///< of mass, in the frame of the contact's points
-};
-
-/// A contact on a feature of a cloth.
-struct ClothSide {
-    static constexpr int kSize = 9;
-    Vec3 weights = Vec3::Zero();                               ///< of the nodes in the closest point
-    std::array<Vec3, 2> slide = {Vec3::Zero(), Vec3::Zero()};  ///< their rates when the point slides
-    double edge_length = 0.0;                                  ///< of an edge
-};
-
-/// What a cloth's feature contributes to a contact: where on it the closest point lies.
-ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, const Surface& cloth, bool of_a);
 
 /// The energy's first derivative along the coordinates of a and of b, and what it is made of.
 template <int N>

@@ -7,6 +7,7 @@
 
 #include "zone/contact_assembly.hpp"
 #include "zone/motion_bounds.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
@@ -319,15 +320,7 @@ void ModelDirection::shorten_blocked(const std::vector<Impact>& impacts, Coordin
     std::vector<char> body(m_zone.bodies.size(), 0), node(m_zone.nodes.size(), 0);
     for (const Impact& impact : impacts) {
         const ZoneContact& contact = m_zone.contacts[impact.contact];
-        for (bool of_a : {true, false}) {
-            if (!of_a && contact.contact.with_ground()) continue;
-            if ((of_a ? contact.cloth_a : contact.cloth_b) >= 0) {
-                for (int n : feature_nodes(m_zone, contact, of_a))
-                    if (n >= 0) node[n] = 1;
-            } else {
-                body[of_a ? contact.a : contact.b] = 1;
-            }
-        }
+        visit_movers(m_zone, contact, [&](int i) { body[i] = 1; }, [&](int i) { node[i] = 1; });
     }
     for (std::size_t i = 0; i < p.bodies.size(); ++i)
         if (body[i]) p.bodies[i] *= 0.5;
@@ -466,15 +459,12 @@ void ModelDirection::damp(const ZonePoint& trial, double rise) {
     for (std::size_t k = 0; k < trial.active.size(); ++k) {
         if (!(excess[k] > kExcess * largest)) continue;
         const ZoneContact& contact = m_zone.contacts[trial.active[k].index];
-        for (bool of_a : {true, false}) {
-            if (!of_a && contact.contact.with_ground()) continue;
-            if ((of_a ? contact.cloth_a : contact.cloth_b) >= 0) {
-                for (int n : feature_nodes(m_zone, contact, of_a))
-                    if (n >= 0) marked[static_cast<std::size_t>(m_zone.dynamic_count + n)] = 1;
-            } else if (m_zone.yields(of_a ? contact.a : contact.b)) {
-                marked[of_a ? contact.a : contact.b] = 1;
-            }
-        }
+        visit_movers(
+            m_zone, contact,
+            [&](int body) {
+                if (m_zone.yields(body)) marked[body] = 1;
+            },
+            [&](int node) { marked[static_cast<std::size_t>(m_zone.dynamic_count + node)] = 1; });
     }
     for (std::size_t i = 0; i < m_weight.size(); ++i)
         if (marked[i]) m_weight[i] = std::max(kProximal, kMoreProximal * m_weight[i]);

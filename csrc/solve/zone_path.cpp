@@ -68,7 +68,7 @@ bool ZonePath::is_fast(int body) const {
 }
 
 bool ZonePath::is_fast(const ZoneContact& contact) const {
-    if (contact.contact.with_ground() || contact.cloth_a >= 0 || contact.cloth_b >= 0) return false;
+    if (contact.contact.with_ground() || contact.has_cloth()) return false;
     return std::any_of(m_gates.begin(), m_gates.end(), [&](const ImpactGate& gate) {
         return gate.fast && gate.a == contact.a && gate.b == contact.b;
     });

@@ -5,6 +5,7 @@
 #include <optional>
 
 #include "math/positive_part.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 
@@ -50,38 +51,11 @@ private:
         m_derivatives.largest_stiffness = std::max(m_derivatives.largest_stiffness, std::sqrt(m_stiffness_sq));
     }
 
-    /// Where the derivatives of a contact's side go.
-    struct BodyPlace {
-        int body;
-        BodySide side;
-    };
-    struct ClothPlace {
-        std::array<int, 3> nodes;
-        ClothSide side;
-    };
-
     void add(int index, const ContactGeometry& geometry) {
         const ZoneContact& contact = m_zone.contacts[index];
-        if (contact.contact.with_ground()) {
-            if (contact.cloth_a >= 0)
-                add_node_on_ground(contact, geometry);
-            else
-                add_body_on_ground(contact, geometry);
-        } else if (contact.cloth_a >= 0) {
-            add_pair(contact, geometry, cloth_on(contact, geometry, true), cloth_on(contact, geometry, false));
-        } else if (contact.cloth_b >= 0) {
-            add_pair(
-                contact, geometry, BodyPlace{contact.a, {m_point.poses[contact.a].t}},
-                cloth_on(contact, geometry, false));
-        } else {
-            add_bodies(contact, geometry);
-        }
-    }
-
-    ClothPlace cloth_on(const ZoneContact& contact, const ContactGeometry& geometry, bool of_a) const {
-        const Surface surface = of_a ? surface_a(m_zone, contact, m_point.poses, m_point.nodes)
-                                     : surface_b(m_zone, contact, m_point.poses, m_point.nodes);
-        return {feature_nodes(m_zone, contact, of_a), cloth_side(contact.contact, geometry, surface, of_a)};
+        with_placed_sides(m_zone, contact, geometry, m_point.poses, m_point.nodes, [&](const auto& a, const auto& b) {
+            add_pair(contact, geometry, a, b);
+        });
     }
 
     void note_scale(double scale_sq, double force, double stiffness) {
@@ -92,25 +66,27 @@ private:
     // --- two bodies --------------------------------------------------------------------------------------------
 
     /// Contacts of the same two bodies follow each other. They are added up along the bodies' relative motion.
-    void add_bodies(const ZoneContact& contact, const ContactGeometry& geometry) {
-        if (contact.a != m_a || contact.b != m_b) begin_bodies(contact);
-        const BodySide a{m_point.poses[m_a].t}, b{m_point.poses[m_b].t};
+    void add_pair(
+        const ZoneContact& contact, const ContactGeometry& geometry, const PlacedSide<BodySide>& placed_a,
+        const PlacedSide<BodySide>& placed_b) {
+        if (placed_a.body != m_a || placed_b.body != m_b) begin_bodies(contact, placed_a.body, placed_b.body);
+        const BodySide &a = placed_a.side, &b = placed_b.side;
         const ContactForce<9> d = m_own_force ? add_relative_curvature(geometry, *m_own_force, a, b, m_hessian)
                                               : add_relative_derivatives(
                                                     geometry, contact.law, a, b, m_with_curvature,
                                                     m_system != nullptr ? &m_hessian : nullptr);
         m_gradient += d.gradient;
         const Vec3 shift = d.row.tail<3>();
-        if (m_zone.yields(m_a))
+        if (placed_a.yields)
             note_scale(scaled_norm_sq(m_zone.bodies[m_a], d.row.head<3>(), shift), d.force, d.stiffness);
-        if (m_zone.yields(m_b))
+        if (placed_b.yields)
             note_scale(scaled_norm_sq(m_zone.bodies[m_b], d.row.segment<3>(3), shift), d.force, d.stiffness);
     }
 
-    void begin_bodies(const ZoneContact& contact) {
+    void begin_bodies(const ZoneContact& contact, int a, int b) {
         end_bodies();
-        m_a = contact.a;
-        m_b = contact.b;
+        m_a = a;
+        m_b = b;
         m_pair = contact.pair;
         m_stiffness = &contact.law.stiffness;
         m_gradient.setZero();
@@ -147,15 +123,17 @@ private:
 
     // --- cloth -------------------------------------------------------------------------------------------------
 
-    bool yields(const BodyPlace& place) const { return m_zone.yields(place.body); }
-    static bool yields(const ClothPlace&) { return true; }
+    static bool yields(const PlacedSide<BodySide>& place) { return place.yields; }
+    static bool yields(const PlacedSide<ClothSide>&) { return true; }
 
-    void add_gradient(const BodyPlace& place, const Vec6& row, const Vec6& gradient, double force, double stiffness) {
+    void add_gradient(
+        const PlacedSide<BodySide>& place, const Vec6& row, const Vec6& gradient, double force, double stiffness) {
         m_derivatives.gradient.bodies[place.body] += gradient;
         note_scale(scaled_norm_sq(m_zone.bodies[place.body], row.head<3>(), row.tail<3>()), force, stiffness);
     }
     void add_gradient(
-        const ClothPlace& place, const Vector<9>& row, const Vector<9>& gradient, double force, double stiffness) {
+        const PlacedSide<ClothSide>& place, const Vector<9>& row, const Vector<9>& gradient, double force,
+        double stiffness) {
         for (int k = 0; k < 3; ++k) {
             const int node = place.nodes[k];
             if (node < 0 || m_zone.nodes[node].pinned) continue;
@@ -164,19 +142,20 @@ private:
         }
     }
 
-    void add_block(const BodyPlace& place, const Mat6& block) { m_system->diagonal(place.body) += block; }
-    void add_block(const ClothPlace& place, const Square<9>& block) {
+    void add_block(const PlacedSide<BodySide>& place, const Mat6& block) { m_system->diagonal(place.body) += block; }
+    void add_block(const PlacedSide<ClothSide>& place, const Square<9>& block) {
         for (int r = 0; r < 3; ++r)
             for (int c = r; c < 3; ++c)
                 if (place.nodes[r] >= 0 && place.nodes[c] >= 0)
                     add_node_block(m_zone, place.nodes[r], place.nodes[c], block.block<3, 3>(3 * r, 3 * c), *m_system);
     }
-    void add_cross(const BodyPlace& a, const ClothPlace& b, const Eigen::Matrix<double, 6, 9>& block) {
+    void add_cross(
+        const PlacedSide<BodySide>& a, const PlacedSide<ClothSide>& b, const Eigen::Matrix<double, 6, 9>& block) {
         for (int k = 0; k < 3; ++k)
             if (b.nodes[k] >= 0 && !m_zone.nodes[b.nodes[k]].pinned)
                 m_system->mixed_pair(m_system->find_mixed_pair(a.body, b.nodes[k])) += block.middleCols<3>(3 * k);
     }
-    void add_cross(const ClothPlace& a, const ClothPlace& b, const Square<9>& block) {
+    void add_cross(const PlacedSide<ClothSide>& a, const PlacedSide<ClothSide>& b, const Square<9>& block) {
         for (int r = 0; r < 3; ++r)
             for (int c = 0; c < 3; ++c)
                 if (a.nodes[r] >= 0 && b.nodes[c] >= 0)
@@ -184,7 +163,8 @@ private:
     }
 
     template <class A>
-    void add_pair(const ZoneContact& contact, const ContactGeometry& geometry, const A& a, const ClothPlace& b) {
+    void add_pair(
+        const ZoneContact& contact, const ContactGeometry& geometry, const A& a, const PlacedSide<ClothSide>& b) {
         constexpr int kA = decltype(a.side)::kSize, kB = ClothSide::kSize;
         ContactDerivatives<kA + kB> d =
             m_own_force
@@ -207,17 +187,19 @@ private:
 
     // --- ground ------------------------------------------------------------------------------------------------
 
-    void add_body_on_ground(const ZoneContact& contact, const ContactGeometry& geometry) {
-        if (contact.a != m_on_ground) {
+    void add_pair(
+        const ZoneContact& contact, const ContactGeometry& geometry, const PlacedSide<BodySide>& a,
+        const PlacedSide<GroundSide>&) {
+        if (a.body != m_on_ground) {
             end_ground();
-            m_on_ground = contact.a;
+            m_on_ground = a.body;
             m_ground = {};
             m_ground_stiffness = &contact.law.stiffness;
         }
-        const Vec3 arm = geometry.closest.point_a - m_point.poses[contact.a].t;
+        const Vec3 arm = geometry.closest.a.point - a.side.center;
         if (m_own_force) return m_ground.add_force(*m_own_force, arm);
         const PotentialValue d = m_ground.add(geometry.distance, arm, contact.law);
-        const ZoneBody& body = m_zone.bodies[contact.a];
+        const ZoneBody& body = m_zone.bodies[a.body];
         const Vec3 turn = GroundContacts::row(arm).head<3>();
         note_scale(turn.dot(body.inverse_inertia * turn) + 1.0 / body.mass, d.force, d.stiffness);
     }
@@ -236,9 +218,11 @@ private:
         m_on_ground = kNobody;
     }
 
-    void add_node_on_ground(const ZoneContact& contact, const ContactGeometry& geometry) {
+    void add_pair(
+        const ZoneContact& contact, const ContactGeometry& geometry, const PlacedSide<ClothSide>& a,
+        const PlacedSide<GroundSide>&) {
         if (m_own_force) return;  // it has no curvature
-        const int node = feature_nodes(m_zone, contact, true)[0];
+        const int node = a.nodes[0];
         if (m_zone.nodes[node].pinned) return;
         const PotentialValue potential = normal_force(contact.law, geometry.distance);
         m_derivatives.gradient.nodes[node].z() -= potential.force;

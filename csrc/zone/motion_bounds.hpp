@@ -1,6 +1,6 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/sides_of.hpp"
 
 /// Bounds on how far things move when the coordinates of a zone change, cheap enough to ask before anything exact.
 namespace diffsim {
@@ -19,7 +19,7 @@ public:
 
     /// Contacts of the same two objects stand one after the other: of bodies the bound is found once for all of them.
     double approach(const ZoneContact& contact) {
-        if (contact.cloth_a >= 0 || contact.cloth_b >= 0) return approach_of_cloth(contact);
+        if (contact.has_cloth()) return approach_of_cloth(contact);
         if (contact.a != m_last_a || contact.b != m_last_b) {
             m_last_a = contact.a;
             m_last_b = contact.b;
@@ -31,7 +31,9 @@ public:
 private:
     double body(int index) const;
     double approach_of_cloth(const ZoneContact& contact) const;
-    double of(const ZoneContact& contact, bool of_a, bool self) const;
+    double of(const SideOfBody& side, bool self) const;
+    double of(const SideOfCloth& side, bool self) const;
+    static double of(const SideOfGround&, bool) { return 0.0; }
 
     const Zone& m_zone;
     const Coordinates &m_begin, &m_end;

@@ -4,11 +4,13 @@
 #include <cmath>
 #include <iterator>
 #include <optional>
+#include <type_traits>
 
 #include "math/positive_part.hpp"
 #include "math/rotation.hpp"
 #include "zone/contact_assembly.hpp"
 #include "zone/motion_bounds.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
@@ -105,7 +107,7 @@ void clear_contacts(Zone& zone) {
 namespace {
 
 /// Have the vertices of a body's feature placed with the zone.
-void list_vertices(Zone& zone, int body, const Contact& contact, bool of_a) {
+void list_vertices(Zone& zone, int body, const Feature& feature) {
     FeatureVertices& vertices = zone.feature_vertices;
     while (static_cast<int>(vertices.first.size()) <= body) {
         const std::size_t first = vertices.listed.size();
@@ -119,53 +121,33 @@ void list_vertices(Zone& zone, int body, const Contact& contact, bool of_a) {
         listed = 1;
     };
     const CollisionMesh& mesh = zone.mesh(body);
-    const int feature = of_a ? contact.feature_a : contact.feature_b;
-    if (contact.type == ContactType::edge_edge) {
-        list(mesh.edges[feature].p0);
-        list(mesh.edges[feature].p1);
-    } else if ((contact.type == ContactType::vertex_patch) == of_a) {
-        list(feature);
-    } else {
-        for (int vertex : mesh.patches[feature].vertices) list(vertex);
+    if (feature.kind == FeatureKind::patch) {
+        for (int vertex : mesh.patches[feature.index].vertices) list(vertex);
+        return;
     }
+    for (int vertex : feature_vertices(mesh, feature))
+        if (vertex >= 0) list(vertex);
 }
 
 }  // namespace
 
 void list_feature_vertices(Zone& zone, const ZoneContact& contact) {
     if (contact.contact.with_ground()) return;
-    if (contact.cloth_a < 0) list_vertices(zone, contact.a, contact.contact, true);
-    if (contact.cloth_b < 0) list_vertices(zone, contact.b, contact.contact, false);
-}
-
-Surface surface_a(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes) {
-    if (contact.cloth_a >= 0)
-        return {&zone.cloth(contact.cloth_a).surface, nullptr, nodes.data() + zone.cloths[contact.cloth_a].first_node};
-    return {&zone.mesh(contact.a), &poses[contact.a], nullptr};
-}
-
-Surface surface_b(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes) {
-    if (contact.contact.with_ground()) return {};
-    if (contact.cloth_b >= 0)
-        return {&zone.cloth(contact.cloth_b).surface, nullptr, nodes.data() + zone.cloths[contact.cloth_b].first_node};
-    return {&zone.mesh(contact.b), &poses[contact.b], nullptr};
+    const auto list = [&](const auto& side) {
+        if constexpr (std::is_same_v<decltype(side), const SideOfBody&>)
+            list_vertices(zone, side.body(), side.feature());
+    };
+    with_sides(zone, contact, [&](const auto& a, const auto& b) {
+        list(a);
+        list(b);
+    });
 }
 
 ContactGeometry contact_geometry(
     const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes) {
-    return {
-        contact.contact, surface_a(zone, contact, poses, nodes), surface_b(zone, contact, poses, nodes),
-        zone.ground_height};
-}
-
-std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, bool of_a) {
-    const int cloth = of_a ? contact.cloth_a : contact.cloth_b;
-    std::array<int, 3> nodes = feature_vertices(zone.cloth(cloth).surface, contact.contact, of_a);
-    for (int& node : nodes)
-        if (node >= 0) node += zone.cloths[cloth].first_node;
-    return nodes;
+    return with_sides(zone, contact, [&](const auto& a, const auto& b) -> ContactGeometry {
+        return {contact.contact, a.surface(poses, nodes), b.surface(poses, nodes), zone.ground_height};
+    });
 }
 
 void rescue_contacts(Zone& zone) {
@@ -208,17 +190,6 @@ void place_vertices(const Zone& zone, ZonePoint& point) {
             point.poses[body] * zone.mesh(body).vertices[vertex];
 }
 
-/// A surface whose vertices are placed. Not for bodies' contacts with the ground.
-Surface placed_surface(const Zone& zone, const ZoneContact& contact, const ZonePoint& point, bool of_a) {
-    const int cloth = of_a ? contact.cloth_a : contact.cloth_b, body = of_a ? contact.a : contact.b;
-    if (cloth >= 0) return {&zone.cloth(cloth).surface, nullptr, point.nodes.data() + zone.cloths[cloth].first_node};
-    return {&zone.mesh(body), &point.poses[body], point.vertices.data() + zone.feature_vertices.first[body]};
-}
-
-}  // namespace
-
-namespace {
-
 double inertial_energy(const Zone& zone, const Coordinates& y) {
     double energy = 0.0;
     for (int i = 0; i < zone.dynamic_count; ++i) {
@@ -248,6 +219,35 @@ double elastic_energy(const Zone& zone, const std::vector<Vec3>& nodes) {
 
 }  // namespace
 
+namespace {
+
+/// Find the distance of a contact, and add what it pushes with.
+template <class A, class B>
+void look_at(const Zone& zone, std::size_t k, const ZoneContact& contact, const A& a, const B& b, ZonePoint& point) {
+    constexpr bool kBodyOnGround = std::is_same_v<A, SideOfBody> && std::is_same_v<B, SideOfGround>;
+    Surface surface;
+    if constexpr (kBodyOnGround) {
+        const Pose& pose = point.poses[a.body()];
+        const double height = pose.R.row(2).dot(a.mesh().vertices[a.feature().index]) + pose.t.z() - zone.ground_height;
+        point.distances[k] = height;
+        if (!(height < contact.law.range.rest)) return;
+        surface = a.surface(point.poses, point.nodes);
+    } else {
+        surface = a.surface(point);
+    }
+    // Made where it stays if it is active.
+    const ContactGeometry& geometry =
+        point.active.emplace_back(static_cast<int>(k), contact.contact, surface, b.surface(point), zone.ground_height)
+            .geometry;
+    point.distances[k] = geometry.distance;
+    if (geometry.distance < contact.law.range.rest)
+        point.contact_energy += contact_energy(geometry, contact.law);
+    else
+        point.active.pop_back();
+}
+
+}  // namespace
+
 void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
     place(zone, point.y, point.poses, point.nodes);
     place_vertices(zone, point);
@@ -267,25 +267,7 @@ void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
                 continue;
             }
         }
-        const bool body_on_ground = contact.contact.with_ground() && contact.cloth_a < 0;
-        if (body_on_ground) {
-            const Pose& pose = point.poses[contact.a];
-            const double height = pose.R.row(2).dot(zone.mesh(contact.a).vertices[contact.contact.feature_a]) +
-                                  pose.t.z() - zone.ground_height;
-            point.distances[k] = height;
-            if (!(height < contact.law.range.rest)) continue;
-        }
-        const Surface a = body_on_ground ? surface_a(zone, contact, point.poses, point.nodes)
-                                         : placed_surface(zone, contact, point, true);
-        const Surface b = contact.contact.with_ground() ? Surface{} : placed_surface(zone, contact, point, false);
-        // Made where it stays if it is active.
-        const ContactGeometry& geometry =
-            point.active.emplace_back(static_cast<int>(k), contact.contact, a, b, zone.ground_height).geometry;
-        point.distances[k] = geometry.distance;
-        if (geometry.distance < contact.law.range.rest)
-            point.contact_energy += contact_energy(geometry, contact.law);
-        else
-            point.active.pop_back();
+        with_sides(zone, contact, [&](const auto& a, const auto& b) { look_at(zone, k, contact, a, b, point); });
     }
     point.energy = inertial + point.elastic_energy + point.contact_energy;
 }
@@ -319,19 +301,17 @@ void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSys
     };
     for (int index : contacts) {
         const ZoneContact& contact = zone.contacts[index];
-        if (contact.contact.with_ground() || contact.cloth_b < 0) continue;
+        if (contact.contact.with_ground()) continue;
         std::array<int, 6> touched;
-        int count = 0;
-        for (bool of_a : {true, false}) {
-            if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) continue;
-            for (int node : feature_nodes(zone, contact, of_a))
-                if (node >= 0) touched[static_cast<std::size_t>(count++)] = node;
-        }
+        int count = 0, body = kNobody;
+        visit_movers(
+            zone, contact, [&](int moved) { body = moved; },
+            [&](int node) { touched[static_cast<std::size_t>(count++)] = node; });
         for (int i = 0; i < count; ++i) {
             const int node = touched[static_cast<std::size_t>(i)];
             for (int j = i + 1; j < count; ++j) couple(node, touched[static_cast<std::size_t>(j)]);
-            if (zone.yields(contact.a) && !zone.nodes[node].pinned && system.find_mixed_pair(contact.a, node) < 0)
-                mixed.emplace_back(contact.a, node);
+            if (zone.yields(body) && !zone.nodes[node].pinned && system.find_mixed_pair(body, node) < 0)
+                mixed.emplace_back(body, node);
         }
     }
     if (mixed.empty() && nodes.empty()) return;

@@ -74,6 +74,8 @@ struct ZoneContact {
     int cloth_a = -1, cloth_b = -1;  ///< indices into Zone::cloths, -1 for others
     int pair;                        ///< block of the Hessian where two bodies yield, or -1
     ContactLaw law;
+
+    bool has_cloth() const { return cloth_a >= 0 || cloth_b >= 0; }
 };
 
 /// The vertices of bodies in features of their contacts with other objects. Most are in several: each is placed once.
@@ -109,6 +111,7 @@ struct Zone {
     int body_count() const { return static_cast<int>(bodies.size()); }
     int node_count() const { return static_cast<int>(nodes.size()); }
     const Cloth& cloth(int index) const { return model->cloths[cloths[index].id]; }
+    /// Whether forces move this body; false for the ground and for nobody.
     bool yields(int body) const { return body >= 0 && body < dynamic_count; }
 };
 
@@ -164,18 +167,9 @@ void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before = null
 /// Where bodies and nodes are at these coordinates.
 void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std::vector<Vec3>& nodes);
 
-/// The surfaces of a contact's two objects; the second is empty with the ground.
-Surface surface_a(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
-Surface surface_b(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
-
 /// The geometry of a contact where bodies and nodes are at these places.
 ContactGeometry contact_geometry(
     const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
-
-/// The nodes of the zone that a contact's feature of a cloth has; -1 fills the rest.
-std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, bool of_a);
 
 /// How the second derivative is taken.
 enum class Curvature {

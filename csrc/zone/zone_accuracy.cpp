@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "zone/sides_of.hpp"
+
 namespace diffsim {
 namespace {
 
@@ -43,10 +45,16 @@ double energy_noise(
         if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
         const ZoneContact& contact = zone.contacts[active.index];
         const double force = normal_force(contact.law, active.geometry.distance).force;
-        const bool yields_a = zone.yields(contact.a), yields_b = zone.yields(contact.b);
-        if (yields_a) pushed[contact.a] += force;
-        if (yields_b) pushed[contact.b] += force;
-        if (!yields_a && !yields_b) force_sum += force;
+        bool on_body = false;
+        visit_movers(
+            zone, contact,
+            [&](int body) {
+                if (!zone.yields(body)) return;
+                pushed[body] += force;
+                on_body = true;
+            },
+            [](int) {});
+        if (!on_body) force_sum += force;
     }
     double square_sum = 0.0;
     for (double force : pushed) square_sum += force * force;

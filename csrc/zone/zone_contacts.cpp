@@ -5,6 +5,7 @@
 
 #include "collision/ccd.hpp"
 #include "zone/motion_bounds.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
@@ -55,14 +56,6 @@ SweptCloth sweep_cloth(
     }
     swept.tree = refitted_tree(swept.mesh(cloth, reach));
     return swept;
-}
-
-/// Sum of the masses of a feature's nodes.
-double feature_mass(const Zone& zone, const ZoneContact& contact, bool of_a) {
-    double mass = 0.0;
-    for (int node : feature_nodes(zone, contact, of_a))
-        if (node >= 0) mass += zone.nodes[node].mass;
-    return mass;
 }
 
 /// Let bodies that do not yield join the zone where its moving bodies come near them.
@@ -121,11 +114,9 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
     entry.pair = -1;
     entry.law.range = contact_range(
         contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
-    const double mass_a = a.cloth >= 0 ? feature_mass(zone, entry, true) : zone.bodies[a.body].mass;
-    const double mass_b = b.cloth >= 0        ? feature_mass(zone, entry, false)
-                          : b.body == kGround ? kInfinity
-                                              : zone.bodies[b.body].mass;
-    entry.law.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
+    entry.law.stiffness = with_sides(zone, entry, [&](const auto& side_a, const auto& side_b) {
+        return contact_stiffness(side_a.mass(), side_b.mass(), zone.compliance);
+    });
     zone.contacts.push_back(entry);
     list_feature_vertices(zone, entry);
 }
@@ -329,9 +320,10 @@ class MotionEnd {
 public:
     MotionEnd(const Zone& zone, const Coordinates& y) : m_zone(zone), m_y(y) {}
 
-    Surface surface(const ZoneContact& contact, bool of_a) {
+    template <class Side>
+    Surface surface(const Side& side) {
         if (m_poses.empty() && m_nodes.empty()) place(m_zone, m_y, m_poses, m_nodes);
-        return of_a ? surface_a(m_zone, contact, m_poses, m_nodes) : surface_b(m_zone, contact, m_poses, m_nodes);
+        return side.surface(m_poses, m_nodes);
     }
 
 private:
@@ -363,9 +355,11 @@ double allowed_step(
         ccd.tolerance = 0.2 * keep;
         if (impacts == nullptr) ccd.until = step;
         if (ccd.until * motion.approach(contact) < room - 1.2 * keep) continue;
-        const double toi = contact_toi(
-            contact.contact, {surface_a(zone, contact, point.poses, point.nodes), end.surface(contact, true)},
-            {surface_b(zone, contact, point.poses, point.nodes), end.surface(contact, false)}, zone.ground_height, ccd);
+        const double toi = with_sides(zone, contact, [&](const auto& a, const auto& b) {
+            return contact_toi(
+                contact.contact, {a.surface(point.poses, point.nodes), end.surface(a)},
+                {b.surface(point.poses, point.nodes), end.surface(b)}, zone.ground_height, ccd);
+        });
         if (toi == kNoImpact) continue;
         step = std::min(step, toi);
         if (impacts != nullptr) impacts->push_back({static_cast<int>(k), toi});

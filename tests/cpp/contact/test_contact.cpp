@@ -76,7 +76,7 @@ struct Situation {
     std::string kind() const {
         const ContactGeometry g = geometry();
         if (g.sine_sq < kParallelLimit) return "mollified";
-        const int slides = g.closest.slide_count_a + g.closest.slide_count_b;
+        const int slides = g.closest.a.slide_count + g.closest.b.slide_count;
         if (contact.type == ContactType::edge_edge) return std::string("edge-edge ") + "021"[slides];
         return std::string("vertex-") + (slides == 2 ? "face" : slides == 1 ? "edge" : "vertex");
     }
@@ -166,7 +166,7 @@ TEST(contact_derivatives_agree_with_differences_for_nearly_parallel_edges) {
         s.press(0.4);
         check_derivatives(s, kMollifiedDifferences);
         const ContactGeometry g = s.geometry();
-        (g.closest.slide_count_a + g.closest.slide_count_b == 2 ? inside : at_ends) += 1;
+        (g.closest.a.slide_count + g.closest.b.slide_count == 2 ? inside : at_ends) += 1;
     }
     CHECK(inside >= 15);
     CHECK(at_ends >= 15);
@@ -265,7 +265,7 @@ TEST(on_the_border_of_a_feature_second_derivatives_are_the_mean_of_both_sides) {
     const auto check = [&](Situation s) {
         const ContactGeometry g = s.geometry();
         const ClosestPoints& closest = g.closest;
-        if (g.distance > 0.35 || g.sine_sq < kParallelLimit || closest.border_count_a + closest.border_count_b == 0)
+        if (g.distance > 0.35 || g.sine_sq < kParallelLimit || closest.a.border_count + closest.b.border_count == 0)
             return false;
         NOTE(s.kind());
         s.range = {1.0, 1.0, 0.0, 0.0, 0.0};
@@ -333,7 +333,7 @@ TEST(ground_derivatives_agree_with_differences) {
             GroundContacts result;
             for (const int vertex : kVertices) {
                 const ContactGeometry g = at(x, vertex);
-                result.add(g.distance, g.closest.point_a - center(x), law);
+                result.add(g.distance, g.closest.a.point - center(x), law);
             }
             return result;
         };
@@ -352,7 +352,7 @@ TEST(ground_derivatives_agree_with_differences) {
         Mat6 rows = Mat6::Zero();
         for (const int vertex : kVertices) {
             const ContactGeometry geometry = at(zero, vertex);
-            const Vec6 row = GroundContacts::row(geometry.closest.point_a - pose.t);
+            const Vec6 row = GroundContacts::row(geometry.closest.a.point - pose.t);
             rows += normal_force(law, geometry.distance).stiffness * row * row.transpose();
         }
         CHECK(g.head<3>().norm() > 1e-3);

@@ -4,6 +4,7 @@
 
 #include "cloth_fixtures.hpp"
 #include "zone/contact_row.hpp"
+#include "zone/sides_of.hpp"
 
 using namespace diffsim;
 using fixtures::dense;
@@ -269,26 +270,24 @@ TEST(dropped_curvature_leaves_mass_elasticity_and_rows) {
                 twist << (at - point.poses[static_cast<std::size_t>(body)].t).cross(normal), normal;
                 row.head<6>() += chart_jacobian(y.bodies[0]).transpose() * twist;
             };
-            const auto add_cloth = [&](bool of_a, const Vec3& normal) {
-                const Surface surface = of_a ? surface_a(zone, contact, point.poses, point.nodes)
-                                             : surface_b(zone, contact, point.poses, point.nodes);
-                const Vec3 weights = cloth_side(contact.contact, active.geometry, surface, of_a).weights;
-                const std::array<int, 3> nodes = feature_nodes(zone, contact, of_a);
+            const auto add_cloth = [&](const SideOfCloth& side, const ClosestPoint& closest, const Vec3& normal) {
+                const Surface surface = side.surface(point.poses, point.nodes);
+                const Vec3 weights = cloth_side(closest, normal, side.feature(), surface).weights;
+                const std::array<int, 3> nodes = side.nodes();
                 for (int k = 0; k < 3; ++k)
                     if (nodes[static_cast<std::size_t>(k)] >= 0)
                         row.segment<3>(6 + 3 * nodes[static_cast<std::size_t>(k)]) += weights[k] * normal;
             };
+            const auto add = [&](const auto& side, const ClosestPoint& closest, const Vec3& normal) {
+                using Side = std::decay_t<decltype(side)>;
+                if constexpr (std::is_same_v<Side, SideOfBody>) add_body(side.body(), closest.point, normal);
+                if constexpr (std::is_same_v<Side, SideOfCloth>) add_cloth(side, closest, normal);
+            };
             const ContactGeometry& g = active.geometry;
-            if (contact.cloth_a >= 0)
-                add_cloth(true, g.normal);
-            else
-                add_body(contact.a, g.closest.point_a, g.normal);
-            if (!contact.contact.with_ground()) {
-                if (contact.cloth_b >= 0)
-                    add_cloth(false, -g.normal);
-                else
-                    add_body(contact.b, g.closest.point_b, -g.normal);
-            }
+            with_sides(zone, contact, [&](const auto& a, const auto& b) {
+                add(a, g.closest.a, g.normal);
+                add(b, g.closest.b, -g.normal);
+            });
             double stiffness = normal_force(contact.law, g.distance).stiffness;
             if (g.sine_sq < kParallelLimit) stiffness *= edge_mollifier(g.sine_sq).value;
             expected += stiffness * row(rows) * row(rows).transpose();
@@ -427,11 +426,12 @@ TEST(patterns_hold_what_elasticity_and_contacts_couple) {
     for (int k : contacts) {
         const ZoneContact& contact = c.zone.contacts[k];
         std::vector<int> touched;
-        for (const bool of_a : {true, false}) {
-            if ((of_a ? contact.cloth_a : contact.cloth_b) < 0 || contact.contact.with_ground()) continue;
-            for (int node : feature_nodes(c.zone, contact, of_a))
-                if (node >= 0 && !c.zone.nodes[node].pinned) touched.push_back(node);
-        }
+        if (contact.contact.with_ground()) continue;
+        visit_movers(
+            c.zone, contact, [](int) {},
+            [&](int node) {
+                if (!c.zone.nodes[node].pinned) touched.push_back(node);
+            });
         for (int i : touched) {
             if (c.zone.yields(contact.a)) mixed.emplace_back(contact.a, i);
             for (int j : touched)
