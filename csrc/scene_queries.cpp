@@ -48,9 +48,7 @@ void check_separation(const Model& model, const Separation& separation, const Sc
 SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state) {
     Zone zone;
-    zone.model = &model;
-    set_compliance(zone, options.compliance);
-    zone.ground_height = model.ground.height;
+    make_zone(zone, model, parameters.cloths, options.compliance, 0.0, Vec3::Zero());
     PassiveBodies passive;
     std::vector<Box> boxes;
     for (int i = 0; i < model.body_count(); ++i) {
@@ -74,7 +72,6 @@ SceneState separate_state(
         SceneControl control;
         control.node_force.assign(state.node_position.size(), Vec3::Zero());
         control.node_velocity = control.node_force;
-        zone.cloth_parameters = &parameters.cloths;
         for (int c = 0; c < model.cloth_count(); ++c) add_cloth(zone, c, state, control, parameters);
     }
     if (zone.bodies.empty() && zone.nodes.empty()) return state;

@@ -40,7 +40,7 @@ void RecordedZones::add_objects(
         first.body < end.body
             ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
             : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
-    start_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
+    make_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
     zone.elastic = !m_options.split;
     memory.workspace.point.y.resize(0, 0);
     for (int b = first.body; b < end.body; ++b) join_body(memory, local, m_record.zones.bodies[b]);

@@ -196,8 +196,7 @@ private:
 
     /// The memory's zone, empty.
     Zone& new_zone(ZoneMemory& memory, const Vec3& origin) const {
-        start_zone(memory.zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
-        return memory.zone;
+        return make_zone(memory.zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
     }
 
     void note(const ZoneResult& result) {

@@ -151,10 +151,7 @@ private:
         for (const ZoneCloth& cloth : contact_zone.cloths) {
             const Cloth& model = m_model.cloths[cloth.id];
             Zone zone;
-            zone.model = &m_model;
-            zone.dt = m_options.dt;
-            zone.cloth_parameters = &m_parameters.cloths;
-            zone.origin = contact_zone.origin;
+            make_zone(zone, m_model, m_parameters.cloths, kDefaultCompliance, m_options.dt, contact_zone.origin);
             zone.contacts_off = true;
             ZonePoint point;
             add_cloth(zone, cloth.id, m_record.start, m_control, m_parameters);

@@ -78,7 +78,7 @@ Pose pose_at(const ZoneBody& body, const Vec6& y) {
     return {exp_rotation(y.head<3>()) * body.start.R, body.start.t + y.tail<3>()};
 }
 
-void start_zone(
+Zone& make_zone(
     Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
     const Vec3& origin) {
     zone.bodies.clear();
@@ -88,12 +88,14 @@ void start_zone(
     clear_contacts(zone);
     zone.model = &model;
     zone.cloth_parameters = &cloths;
-    set_compliance(zone, compliance);
+    zone.hard = compliance == 0.0;
+    zone.compliance = zone.hard ? kDefaultCompliance : compliance;
     zone.dt = dt;
     zone.origin = origin;
     zone.ground_height = model.ground.height - origin.z();
     zone.elastic = true;
     zone.contacts_off = false;
+    return zone;
 }
 
 void clear_contacts(Zone& zone) {

@@ -121,14 +121,9 @@ void clear_contacts(Zone& zone);
 /// Have the vertices of bodies that a contact needs placed with the zone.
 void list_feature_vertices(Zone& zone, const ZoneContact& contact);
 
-/// Compliance 0 asks for hard contacts.
-inline void set_compliance(Zone& zone, double compliance) {
-    zone.hard = compliance == 0.0;
-    zone.compliance = zone.hard ? kDefaultCompliance : compliance;
-}
-
-/// Empty a zone, for bodies and cloths of a model to join it.
-void start_zone(
+/// Make an empty zone in the memory of another one, for bodies and cloths of a model to join: the one way to make a zone.
+/// Compliance 0 asks for hard contacts. Returns `zone`.
+Zone& make_zone(
     Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
     const Vec3& origin);
 

@@ -72,11 +72,7 @@ struct Scene {
     }
     Zone zone() const {
         Zone result;
-        result.dt = kDt;
-        result.cloth_parameters = &materials;
-        result.model = &model;
-        set_compliance(result, compliance);
-        result.ground_height = model.ground.height;
+        make_zone(result, model, materials, compliance, kDt, Vec3::Zero());
         result.bodies = bodies;
         result.dynamic_count = static_cast<int>(bodies.size());
         for (int i = 0; i < model.cloth_count(); ++i) {

@@ -32,7 +32,7 @@ struct Scene {
 
     Scene() {
         model.thickness = kThickness;
-        start_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
     }
     void add_box(const Pose& pose, const Vec6& target) {
         const Vec3 half = Vec3::Constant(kHalf);

@@ -27,7 +27,7 @@ struct Cubes {
         if (on_ground) model.ground = {true, 0.0, 0.5 * kThickness};
         const Vec3 half = Vec3::Constant(kHalf);
         for (int i = 0; i < 2; ++i) model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
-        start_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
         const double height = kHalf + kThickness * (1.0 - 1e-5);  // just touching
         for (int i = 0; i < 2; ++i) {
             const Pose pose{Mat3::Identity(), Vec3(i * (2.0 * kHalf + kGap), 0.0, height)};

@@ -71,10 +71,10 @@ void add_all_contacts(Zone& zone) {
 
 /// A zone at coordinates turned by up to 2 rad, where its bodies are near each other: the start lies that much before.
 Zone random_zone(const Model& model, check::Random& random, Coordinates& y) {
+    static const std::vector<ClothParameters> no_cloth;
     Zone zone;
-    zone.model = &model;
+    make_zone(zone, model, no_cloth, kDefaultCompliance, 0.01, Vec3::Zero());
     zone.dynamic_count = 3;
-    zone.ground_height = model.ground.height;
     y = Coordinates();
     const Vec3 places[5] = {{-0.8, 0, -0.4}, {0.8, 0.1, -0.3}, {0, 0, 0.95}, {0, 1.35, 0}, {0, -1.2, 0}};
     for (int i = 0; i < 5; ++i) {

@@ -45,11 +45,7 @@ struct Case {
 Case random_case(const Room& room, check::Random& random) {
     Case c;
     Zone& zone = c.zone;
-    zone.model = &room.model;
-    zone.dt = kDt;
-    zone.compliance = 0.01;
-    zone.ground_height = room.model.ground.height;
-    zone.cloth_parameters = &room.materials;
+    make_zone(zone, room.model, room.materials, 0.01, kDt, Vec3::Zero());
     Vec6 turned;
     turned << random.uniform(0.2, 2.0) * fixtures::random_direction(random), random_vec3(random, 0.3);
     const Mat3 R = exp_rotation(random_vec3(random, 0.2));
