@@ -22,8 +22,8 @@ bool HardContacts::Shifted::operator<(const Shifted& other) const {
 double HardContacts::violation(const Zone& zone, const ZonePoint& point, double position) {
     double violation = 0.0;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
-        const ContactRange& range = zone.contacts[k].law.range;
-        const double shift = zone.contacts[k].law.shift;
+        const ContactRange& range = zone.contacts.law(k).range;
+        const double shift = zone.contacts.law(k).shift;
         const double compression = std::max(range.rest - point.distances[k], 0.0);
         const double distance = std::abs(compression - shift);
         if (distance > 16.0 * kEpsilon * position)
@@ -38,24 +38,27 @@ void HardContacts::shift(Zone& zone, const ZonePoint& point, double violation) {
     m_left = violation;
     zone.compliance /= stiffening;
     m_shifted.clear();
+    zone.contacts.split_laws();
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
-        ZoneContact& contact = zone.contacts[k];
-        const double force = normal_force(contact.law, point.distances[k]).force;
-        contact.law.stiffness.value *= stiffening;
-        shift_rest(contact.law, force);
-        if (contact.law.shift > 0.0) m_shifted.push_back({contact.contact, contact.law.shift});
+        ContactLaw& law = zone.contacts.laws[k];
+        const double force = normal_force(law, point.distances[k]).force;
+        law.stiffness.value *= stiffening;
+        shift_rest(law, force);
+        if (law.shift > 0.0) m_shifted.push_back({zone.contacts[k].contact, law.shift});
     }
     std::sort(m_shifted.begin(), m_shifted.end());
 }
 
 void HardContacts::restore(Zone& zone) const {
     if (m_shifted.empty()) return;
-    for (ZoneContact& contact : zone.contacts) {
-        const Shifted key{contact.contact, 0.0};
+    zone.contacts.split_laws();
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
+        const Shifted key{zone.contacts[k].contact, 0.0};
         const auto found = std::lower_bound(m_shifted.begin(), m_shifted.end(), key);
         if (found == m_shifted.end() || key < *found) continue;
-        contact.law.shift = found->shift;
-        contact.law.range.rest += found->shift;
+        ContactLaw& law = zone.contacts.laws[k];
+        law.shift = found->shift;
+        law.range.rest += found->shift;
     }
 }
 

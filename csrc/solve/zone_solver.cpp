@@ -73,7 +73,7 @@ private:
         evaluate(m_zone, m_w.point);
         bool rescue = false;  // some objects start the step below their floor
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-            const ContactRange& range = m_zone.contacts[k].law.range;
+            const ContactRange& range = m_zone.contacts.law(k).range;
             rescue = rescue || m_w.point.distances[k] < range.floor;
             if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
             m_result.status = ZoneStatus::bad_start;
@@ -337,7 +337,7 @@ private:
         set_step_end();
         double range = kInfinity;
         for (const ActiveContact& active : m_w.point.active) {
-            const ContactRange& r = m_zone.contacts[active.index].law.range;
+            const ContactRange& r = m_zone.contacts.law(active.index).range;
             range = std::min(range, r.rest - r.floor);
         }
         const double scale = range / largest_move();

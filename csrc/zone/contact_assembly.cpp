@@ -87,7 +87,7 @@ private:
         end_bodies();
         m_a = a;
         m_b = b;
-        m_pair = contact.pair;
+        m_pair = contact.block;
         m_stiffness = &contact.law.stiffness;
         m_gradient.setZero();
         m_hessian.set_zero();

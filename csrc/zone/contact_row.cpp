@@ -11,7 +11,7 @@ ContactRow make_row(
     const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const Placement& at,
     const Coordinates& y_now, double wanted) {
     ContactRow row;
-    row.pair = contact.pair;
+    row.pair = contact.block;
     row.stiffness = contact.law.stiffness.value;
     row.missing = wanted - geometry.distance;
     row.relative.tail<3>() = -geometry.normal;

@@ -27,7 +27,7 @@ public:
     }
     /// With its vertices placed. Not for contacts with the ground.
     Surface surface(const ZonePoint& point) const {
-        return {&mesh(), &point.poses[m_body], point.vertices.data() + m_zone.feature_vertices.first[m_body]};
+        return {&mesh(), &point.poses[m_body], point.vertices.data() + m_zone.contacts.vertices.first[m_body]};
     }
     /// Call visit_body(body) or visit_node(node) with everything that moves it.
     template <class VisitBody, class VisitNode>

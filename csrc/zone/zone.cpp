@@ -85,7 +85,7 @@ Zone& make_zone(
     zone.nodes.clear();
     zone.cloths.clear();
     zone.dynamic_count = 0;
-    clear_contacts(zone);
+    zone.contacts.clear();
     zone.model = &model;
     zone.cloth_parameters = &cloths;
     zone.hard = compliance == 0.0;
@@ -98,19 +98,11 @@ Zone& make_zone(
     return zone;
 }
 
-void clear_contacts(Zone& zone) {
-    zone.contacts.clear();
-    zone.pairs.clear();
-    zone.feature_vertices.entries.clear();
-    zone.feature_vertices.first.clear();
-    zone.feature_vertices.listed.clear();
-}
-
 namespace {
 
 /// Have the vertices of a body's feature placed with the zone.
 void list_vertices(Zone& zone, int body, const Feature& feature) {
-    FeatureVertices& vertices = zone.feature_vertices;
+    FeatureVertices& vertices = zone.contacts.vertices;
     while (static_cast<int>(vertices.first.size()) <= body) {
         const std::size_t first = vertices.listed.size();
         const std::size_t count = zone.mesh(static_cast<int>(vertices.first.size())).vertices.size();
@@ -157,8 +149,10 @@ void rescue_contacts(Zone& zone) {
     std::vector<Vec3> nodes;
     for (const ZoneBody& body : zone.bodies) poses.push_back(body.start);
     for (const ZoneNode& node : zone.nodes) nodes.push_back(node.start);
-    for (ZoneContact& contact : zone.contacts) {
-        contact.law.range = rescued_range(contact.law.range, contact_geometry(zone, contact, poses, nodes).distance);
+    zone.contacts.split_laws();
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
+        ContactRange& range = zone.contacts.laws[k].range;
+        range = rescued_range(range, contact_geometry(zone, zone.contacts[k], poses, nodes).distance);
     }
 }
 
@@ -186,9 +180,10 @@ void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std
 namespace {
 
 void place_vertices(const Zone& zone, ZonePoint& point) {
-    point.vertices.resize(zone.feature_vertices.listed.size());
-    for (const auto& [body, vertex] : zone.feature_vertices.entries)
-        point.vertices[zone.feature_vertices.first[body] + vertex] =
+    const FeatureVertices& vertices = zone.contacts.vertices;
+    point.vertices.resize(vertices.listed.size());
+    for (const auto& [body, vertex] : vertices.entries)
+        point.vertices[vertices.first[body] + vertex] =
             point.poses[body] * zone.mesh(body).vertices[vertex];
 }
 
@@ -289,7 +284,7 @@ BlockPattern cloth_pattern(const Zone& zone) {
 BlockPattern base_pattern(const Zone& zone) {
     BlockPattern pattern = cloth_pattern(zone);
     pattern.body_count = zone.dynamic_count;
-    pattern.body_pairs = zone.pairs;
+    pattern.body_pairs = zone.contacts.blocks;
     return pattern;
 }
 

@@ -5,6 +5,7 @@
 #include "contact/contact_derivatives.hpp"
 #include "dynamics/cloth_elasticity.hpp"
 #include "zone/block_system.hpp"
+#include "zone/contact_set.hpp"
 
 /// An impact zone: bodies and cloths that may touch during a step, solved together.
 ///
@@ -68,26 +69,6 @@ struct PassiveBodies {
     BoxTree tree;  ///< over boxes inflated by the bodies' margins, world frame
 };
 
-struct ZoneContact {
-    Contact contact;
-    int a, b;                        ///< indices into Zone::bodies, kNobody for cloth; b is kGround with the ground
-    int cloth_a = -1, cloth_b = -1;  ///< indices into Zone::cloths, -1 for others
-    int pair;                        ///< block of the Hessian where two bodies yield, or -1
-    ContactLaw law;
-
-    bool has_cloth() const { return cloth_a >= 0 || cloth_b >= 0; }
-};
-
-/// The vertices of bodies in features of their contacts with other objects. Most are in several: each is placed once.
-struct FeatureVertices {
-    struct Entry {
-        int body, vertex;
-    };
-    std::vector<Entry> entries;
-    std::vector<int> first;    ///< per body: its vertex v stands at first[body] + v of ZonePoint::vertices
-    std::vector<char> listed;  ///< whether it stands there; only vertices in entries do
-};
-
 /// Bodies (the dynamic ones first) and the contacts that can become active.
 struct Zone {
     const Model* model = nullptr;
@@ -103,9 +84,7 @@ struct Zone {
     const std::vector<ClothParameters>* cloth_parameters = nullptr;  ///< of all cloths of the model
     bool elastic = true;        ///< false: cloth is loose nodes, as in the contact pass of split coupling
     bool contacts_off = false;  ///< as in its elastic pass
-    std::vector<ZoneContact> contacts;
-    FeatureVertices feature_vertices;  ///< of the contacts
-    IndexPairs pairs;                  ///< of dynamic bodies with contacts
+    ContactSet contacts;
 
     const CollisionMesh& mesh(int body) const { return model->bodies[bodies[body].id].mesh; }
     int body_count() const { return static_cast<int>(bodies.size()); }
@@ -114,9 +93,6 @@ struct Zone {
     /// Whether forces move this body; false for the ground and for nobody.
     bool yields(int body) const { return body >= 0 && body < dynamic_count; }
 };
-
-/// Remove its contacts.
-void clear_contacts(Zone& zone);
 
 /// Have the vertices of bodies that a contact needs placed with the zone.
 void list_feature_vertices(Zone& zone, const ZoneContact& contact);
@@ -147,7 +123,7 @@ struct ZonePoint {
     Coordinates y;
     std::vector<Pose> poses;
     std::vector<Vec3> nodes;        ///< positions, zone frame
-    std::vector<Vec3> vertices;     ///< of bodies, zone frame; those of Zone::feature_vertices
+    std::vector<Vec3> vertices;     ///< of bodies, zone frame; those of ContactSet::vertices
     std::vector<double> distances;  ///< one per contact; beyond its rest distance maybe a lower bound [m]
     std::vector<ActiveContact> active;
     double energy = 0.0;          ///< infinite at or below a pole

@@ -95,30 +95,17 @@ double contact_margins(const Model& model, const Contact& contact) {
 }
 
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
-    if (a.cloth < 0 && b.cloth < 0 && !zone.hard && !zone.contacts.empty()) {
-        // Of the same bodies as the last one: only the features differ.
-        const Contact& last = zone.contacts.back().contact;
-        if (last.object_a == contact.object_a && last.object_b == contact.object_b) {
-            zone.contacts.push_back(zone.contacts.back());
-            zone.contacts.back().contact = contact;
-            list_feature_vertices(zone, zone.contacts.back());
-            return;
-        }
+    ContactSet& set = zone.contacts;
+    const bool own_law = a.cloth >= 0 || b.cloth >= 0 || zone.hard;
+    if (set.append(contact, a, b, own_law)) {
+        const ContactRange range = contact_range(
+            contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
+        set.laws.push_back({range, {}});
+        set.laws.back().stiffness = with_sides(zone, set[set.size() - 1], [&](const auto& side_a, const auto& side_b) {
+            return contact_stiffness(side_a.mass(), side_b.mass(), zone.compliance);
+        });
     }
-    ZoneContact entry;
-    entry.contact = contact;
-    entry.a = a.body;
-    entry.b = b.body;
-    entry.cloth_a = a.cloth;
-    entry.cloth_b = b.cloth;
-    entry.pair = -1;
-    entry.law.range = contact_range(
-        contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
-    entry.law.stiffness = with_sides(zone, entry, [&](const auto& side_a, const auto& side_b) {
-        return contact_stiffness(side_a.mass(), side_b.mass(), zone.compliance);
-    });
-    zone.contacts.push_back(entry);
-    list_feature_vertices(zone, entry);
+    list_feature_vertices(zone, set[set.size() - 1]);
 }
 
 namespace {
@@ -140,7 +127,7 @@ public:
           m_features(coverage.scratch.features) {}
 
     void run() {
-        clear_contacts(m_zone);
+        m_zone.contacts.clear();
         m_coverage.slack.clear();
         m_coverage.cloth_slack.clear();
         m_meshes.clear();
@@ -233,13 +220,11 @@ private:
             collect_feature_pairs(m_feature_boxes[i], m_feature_boxes[j], m_features);
             if (j >= m_zone.body_count()) drop_distant_pairs(m_meshes[i], m_meshes[j], m_features);
             if (m_features.empty()) continue;
-            const std::size_t first = m_zone.contacts.size();
             for (const FeaturePair& f : m_features)
                 add_contact(m_zone, {id(i), id(j), f.type, f.feature_a, f.feature_b}, object(i), object(j));
             if (j >= m_zone.dynamic_count) continue;
-            for (std::size_t k = first; k < m_zone.contacts.size(); ++k)
-                m_zone.contacts[k].pair = static_cast<int>(m_zone.pairs.size());
-            m_zone.pairs.emplace_back(i, j);
+            m_zone.contacts.pairs.back().block = static_cast<int>(m_zone.contacts.blocks.size());
+            m_zone.contacts.blocks.emplace_back(i, j);
         }
     }
 

@@ -21,12 +21,6 @@ struct ContactCoverage {
     } scratch;
 };
 
-/// An object of a zone: a body, a cloth, or {kGround}.
-struct ZoneObject {
-    int body = kNobody;
-    int cloth = -1;
-};
-
 /// The distance at which the two features of a contact rest: the sum of their margins. Features of one cloth may be nearer
 /// at rest than its thickness: there they keep half of that.
 double contact_margins(const Model& model, const Contact& contact);

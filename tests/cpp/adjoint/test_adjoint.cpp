@@ -27,6 +27,14 @@ struct Sheet {
     std::vector<double> mass;
 };
 
+/// Append a contact like this one, of another set.
+void append(ContactSet& set, const ZoneContact& contact) {
+    set.append(contact.contact, {contact.a, contact.cloth_a}, {contact.b, contact.cloth_b}, true);
+    set.laws.push_back(contact.law);
+    set.pairs.back().block = contact.block;
+}
+
+
 /// Bodies and cloths at rest or landing, and how they are solved.
 struct Scene {
     Model model;
@@ -92,8 +100,10 @@ struct Scene {
         std::vector<Box> visited;
         const ZoneResult outcome = solve_zone(result, passive, ZoneOptions(), workspace, visited);
         CHECK(outcome.status == ZoneStatus::converged);
-        std::vector<ZoneContact> active;
-        for (const ActiveContact& a : workspace.point.active) active.push_back(result.contacts[a.index]);
+        ContactSet active;
+        for (const ActiveContact& a : workspace.point.active) append(active, result.contacts[a.index]);
+        active.blocks = result.contacts.blocks;
+        active.vertices = result.contacts.vertices;
         result.contacts = active;
         point.y = workspace.point.y;
         evaluate(result, point);
@@ -209,8 +219,9 @@ TEST(dense_and_qr_solve_the_same_system_on_redundant_rows) {
     check_same_system(zone, point);
 
     // Every row many times over.
-    const std::vector<ZoneContact> once = zone.contacts;
-    for (int copy = 0; copy < 4; ++copy) zone.contacts.insert(zone.contacts.end(), once.begin(), once.end());
+    const ContactSet once = zone.contacts;
+    for (int copy = 0; copy < 4; ++copy)
+        for (const ZoneContact& contact : once) append(zone.contacts, contact);
     evaluate(zone, point);
     CHECK(point.active.size() >= 100);
     check_same_system(zone, point);
@@ -250,7 +261,6 @@ TEST(dense_and_qr_do_without_contacts) {
     const Scene scene = stack();
     Zone zone = scene.solve(point);
     zone.contacts.clear();
-    zone.pairs.clear();
     evaluate(zone, point);
     CHECK(point.active.empty());
     check_same_system(zone, point);

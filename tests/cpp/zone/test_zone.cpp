@@ -33,24 +33,20 @@ Model near_bodies() {
 }
 
 void add_contact(Zone& zone, int a, int b, ContactType type, int feature_a, int feature_b) {
-    ZoneContact contact;
-    contact.contact = {a, b, type, feature_a, feature_b};
-    contact.a = a;
-    contact.b = b;
-    contact.pair = -1;
-    for (int k = 0; k < static_cast<int>(zone.pairs.size()); ++k)
-        if (zone.pairs[k] == std::pair(std::min(a, b), std::max(a, b))) contact.pair = k;
-    contact.law.range = contact_range(kThickness, kThickness);
-    contact.law.stiffness = {10.0, 0.0, 0.0};
-    zone.contacts.push_back(contact);
-    list_feature_vertices(zone, contact);
+    ContactSet& set = zone.contacts;
+    if (set.append({a, b, type, feature_a, feature_b}, {a, -1}, {b, -1}, false)) {
+        set.laws.push_back({contact_range(kThickness, kThickness), {10.0, 0.0, 0.0}});
+        for (int k = 0; k < static_cast<int>(set.blocks.size()); ++k)
+            if (set.blocks[k] == std::pair(std::min(a, b), std::max(a, b))) set.pairs.back().block = k;
+    }
+    list_feature_vertices(zone, set[set.size() - 1]);
 }
 
 /// Every pair of features of bodies of which one yields. The order of a and b alternates.
 void add_all_contacts(Zone& zone) {
     const int count = zone.body_count(), dynamic = zone.dynamic_count;
     for (int i = 0; i < dynamic; ++i)
-        for (int j = i + 1; j < dynamic; ++j) zone.pairs.emplace_back(i, j);
+        for (int j = i + 1; j < dynamic; ++j) zone.contacts.blocks.emplace_back(i, j);
     for (int i = 0; i < dynamic; ++i) {
         for (int v : zone.mesh(i).active_vertices) add_contact(zone, i, kGround, ContactType::vertex_patch, v, -1);
         for (int j = i + 1; j < count; ++j) {

@@ -80,7 +80,7 @@ Case random_case(const Room& room, check::Random& random) {
     ContactCoverage coverage;
     collect_contacts(zone, passive, begin, end, coverage);
     c.y = end;
-    for (ZoneContact& contact : zone.contacts) contact.law.stiffness = {10.0, 0.0, 0.0};
+    for (ContactLaw& law : zone.contacts.laws) law.stiffness = {10.0, 0.0, 0.0};
     return c;
 }
 
@@ -122,7 +122,7 @@ bool is_stable(const Zone& zone, const Coordinates& y) {
     const ZonePoint here = point_at(zone, y, VectorX::Zero(size));
     if (here.energy == kInfinity) return false;
     for (const ActiveContact& active : here.active) {
-        const ContactRange& range = zone.contacts[active.index].law.range;
+        const ContactRange& range = zone.contacts.law(active.index).range;
         if (active.geometry.distance < range.pole + 0.15 * (range.rest - range.pole)) return false;
     }
     for (Eigen::Index i = 0; i < size; ++i)

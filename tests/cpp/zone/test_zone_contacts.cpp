@@ -240,10 +240,10 @@ TEST(contacts_name_their_objects_and_blocks) {
             check_side(contact.contact.object_a, contact.a, contact.cloth_a);
             check_side(contact.contact.object_b, contact.b, contact.cloth_b);
             const bool two_bodies = zone.yields(contact.a) && zone.yields(contact.b);
-            CHECK((contact.pair >= 0) == two_bodies);
+            CHECK((contact.block >= 0) == two_bodies);
             if (two_bodies)
                 CHECK(
-                    zone.pairs[contact.pair] ==
+                    zone.contacts.blocks[contact.block] ==
                     std::pair(std::min(contact.a, contact.b), std::max(contact.a, contact.b)));
             CHECK(contact.law.range.rest == contact_margins(room.model, contact.contact));
             cases_hit += contact.cloth_b >= 0 ? 1 : 0;
@@ -286,7 +286,7 @@ TEST(pairs_left_out_have_not_come_near) {
             for (std::size_t i = 0; i < all.active.size(); ++i) CHECK(some.active[i].index == all.active[i].index);
             for (std::size_t i = 0; i < all.distances.size(); ++i) {
                 const bool known = some.distances[i] == all.distances[i];
-                CHECK((known || some.distances[i] > c.zone.contacts[i].law.range.rest));
+                CHECK((known || some.distances[i] > c.zone.contacts.law(i).range.rest));
                 CHECK(some.distances[i] <= all.distances[i] + 1e-15);
                 (known ? looked_at : left_out) += 1;
             }
@@ -319,7 +319,7 @@ TEST(an_allowed_step_keeps_cloth_above_its_floor) {
         evaluate(c.zone, point);
         bool apart = true;
         for (std::size_t i = 0; i < c.zone.contacts.size(); ++i)
-            apart = apart && point.distances[i] > c.zone.contacts[i].law.range.floor;
+            apart = apart && point.distances[i] > c.zone.contacts.law(i).range.floor;
         if (!apart) continue;
         std::vector<Impact> impacts;
         const double step = allowed_step(c.zone, point, c.end, &impacts);
