@@ -12,11 +12,11 @@
 namespace diffsim {
 namespace {
 
-/// Hard contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
+/// Exact contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
 /// gives way. Every step leaves about a compliance's part; they end when z no longer changes, since a small J z alone
 /// does not mean that z is right. Returns the reactions, the last step's left out: the soft contacts carry it.
 template <typename SolveInPlace>
-std::vector<double> harden(
+std::vector<double> find_reactions(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const SolveInPlace& solve_in_place,
     Coordinates& z) {
     constexpr int kMaxSteps = 30;
@@ -66,19 +66,19 @@ std::vector<double> harden(
     return reactions;
 }
 
-/// Overwrite the upstream gradient by z. Returns the reactions of contacts, if they are hard.
+/// Overwrite the upstream gradient by z. Returns the reactions of contacts, if they are exact.
 template <typename SolveInPlace>
 std::vector<double> solve(
     const Zone& zone, const ZonePoint& point, Coordinates& z, const SolveInPlace& solve_in_place) {
-    const Coordinates upstream = zone.hard ? z : Coordinates();
+    const Coordinates upstream = zone.exact_contact ? z : Coordinates();
     solve_in_place(z);
-    return zone.hard ? harden(zone, point, upstream, solve_in_place, z) : std::vector<double>();
+    return zone.exact_contact ? find_reactions(zone, point, upstream, solve_in_place, z) : std::vector<double>();
 }
 
 /// What the contacts of a body that yields take of the upstream gradient v, along its twist J dy at the end of the step.
 /// With H = M + C + Jᵀ K J the matrix of  H z = v,  K of the contacts and C the curvature of the chart under their torque:
 ///     K J z + Jᵀ⁻¹ (M + C) z = Jᵀ⁻¹ v.
-/// Of hard contacts, whose reactions stand beside H z, they are part of it.
+/// Of exact contacts, whose reactions stand beside H z, they are part of it.
 Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, const Vec6& v, const Vec6& z) {
     Vec6 share = v;
     share.head<3>() -= body.inertia * z.head<3>();
@@ -105,7 +105,7 @@ void add_body_stiffness(
 }
 
 /// What contacts add to the gradients: to those of places that the linear system has no rows for, `twist` times their
-/// second derivatives and the reactions of hard ones; with cloth, to those of masses, through their stiffness.
+/// second derivatives and the reactions of exact ones; with cloth, to those of masses, through their stiffness.
 /// `multipliers`: stiffness times what opens each contact along `twist`, where contacts are rows of constant direction;
 /// null where they have curvature.
 void add_contacts(
@@ -115,8 +115,8 @@ void add_contacts(
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
         const bool with_place = needs.place && !is_of_yielding_bodies(zone, contact);
-        // A hard contact's stiffness is only how its multiplier was found.
-        const bool through_stiffness = needs.mass && !zone.hard && contact.has_cloth();
+        // An exact contact's stiffness is only how its multiplier was found.
+        const bool through_stiffness = needs.mass && !zone.exact_contact && contact.has_cloth();
         if (!with_place && !through_stiffness) continue;
         const ContactTerm term =
             contact_term(zone, point, active, with_place && multipliers == nullptr ? Curvature::full : Curvature::none);
@@ -130,7 +130,7 @@ void add_contacts(
                 gradient = term.hessian.lazyProduct(motion);  // of this size a library call is slower
             else
                 gradient = (*multipliers)[static_cast<Eigen::Index>(k)] * term.row;
-            if (zone.hard) gradient += reactions[k] * term.row;
+            if (zone.exact_contact) gradient += reactions[k] * term.row;
             term.for_each(
                 [&](int body, int offset) {
                     if (!zone.yields(body)) result.place_gradient.bodies[body] -= gradient.segment<6>(offset);
@@ -222,7 +222,7 @@ const ZoneAdjoint& zone_adjoint(
         // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
         gradient.head<3>() -= 0.5 * torque.cross(twist[i].head<3>());
     }
-    if (needs.mass && !zone.hard) {
+    if (needs.mass && !zone.exact_contact) {
         if (!exact) differentiate(zone, point, Curvature::none, derivatives, nullptr);
         add_body_stiffness(zone, derivatives.body_contacts, twist, result);
     }

@@ -37,8 +37,8 @@ struct Contact {
     }
 };
 
-/// What the multiplier of a hard contact follows from: it acts as one with this compliance and its rest distance shifted.
-struct HardContact {
+/// What the multiplier of an exact contact follows from: it acts as one with this compliance and its rest distance shifted.
+struct ExactContact {
     double shift;  ///< [m]
     double compliance;
 };

@@ -30,7 +30,7 @@ bool before(const Contact& c, const Contact& d) {
 
 }  // namespace
 
-ModelDirection::ModelDirection(Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system)
+ModelDirection::ModelDirection(const Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system)
     : m_zone(zone), m_path(path), m_point(point), m_system(system) {}
 
 // --- forces, across lists of contacts ---------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "math/rotation.hpp"
+#include "zone/contact_memory.hpp"
 #include "zone/zone_contacts.hpp"
 
 namespace diffsim {
@@ -112,11 +113,11 @@ void RecordedZones::list_contacts(
     };
     for (int c = first.contact; c < end.contact; ++c) {
         const Contact& contact = m_record.zones.contacts[c];
-        if (zone.hard) zone.compliance = m_record.zones.hard[c].compliance;
+        if (zone.exact_contact) zone.contacts.memory.compliance = m_record.zones.exact[c].compliance;
         add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
-        if (!zone.hard) continue;
+        if (!zone.exact_contact) continue;
         ContactLaw& law = zone.contacts.laws.back();
-        law.shift = m_record.zones.hard[c].shift;
+        law.shift = m_record.zones.exact[c].shift;
         law.range.rest += law.shift;
     }
     number_blocks(zone);

@@ -406,7 +406,7 @@ private:
             const ZoneContact& contact = zone.contacts[active.index];
             const Contact& c = contact.contact;
             results.contacts.push_back(c);
-            results.hard.push_back({contact.law.shift, zone.compliance});
+            results.exact.push_back({contact.law.shift, zone.contacts.memory.compliance});
             outcome.max_compression = std::max(
                 outcome.max_compression, contact.law.range.rest - contact.law.shift - active.geometry.distance);
             std::uint64_t& hash = outcome.signature;
@@ -460,7 +460,7 @@ private:
             const GroupResults& results = m_workspace.memory(outcome.thread).results;
             const int first = outcome.first_contact;
             m.contact_lists.push_back(
-                {results.contacts.data() + first, results.hard.data() + first, outcome.contact_end - first});
+                {results.contacts.data() + first, results.exact.data() + first, outcome.contact_end - first});
         }
         m.zone_finder.find(
             m_model, m.movers, m.contact_lists, m_options.compliance == 0.0, m_options.global_zone, m.zones);

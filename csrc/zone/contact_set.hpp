@@ -52,28 +52,44 @@ struct FeatureVertices {
     std::vector<char> listed;  ///< whether it stands there; only vertices in entries do
 };
 
+/// An exact contact that pushes, in one list as in the next.
+struct ShiftedContact {
+    Contact contact;
+    double shift;  ///< ContactLaw::shift [m]
+};
+
+/// What contacts keep while a zone is solved, however often they are listed anew; see zone/contact_memory.hpp.
+struct ContactMemory {
+    double compliance = 0.0;              ///< of contacts that are listed: rounds of multipliers may stiffen them
+    bool rescued = false;                 ///< ranges are widened where objects start the step next to their pole
+    std::vector<ShiftedContact> shifted;  ///< sorted
+};
+
 struct ContactSet {
     std::vector<ObjectPair> pairs;
     std::vector<FeatureContact> contacts;
     std::vector<ContactLaw> laws;
     FeatureVertices vertices;
     IndexPairs blocks;  ///< of dynamic bodies with contacts
+    ContactMemory memory;
 
     std::size_t size() const { return contacts.size(); }
     bool empty() const { return contacts.empty(); }
     ZoneContact operator[](std::size_t k) const {
         const FeatureContact& f = contacts[k];
         const ObjectPair& pair = pairs[f.pair];
-        return {{pair.object_a, pair.object_b, f.type, f.feature_a, f.feature_b},
-                pair.a.body,
-                pair.b.body,
-                pair.a.cloth,
-                pair.b.cloth,
-                pair.block,
-                laws[law_index(k, pair)]};
+        return {
+            {pair.object_a, pair.object_b, f.type, f.feature_a, f.feature_b},
+            pair.a.body,
+            pair.b.body,
+            pair.a.cloth,
+            pair.b.cloth,
+            pair.block,
+            laws[law_index(k, pair)]};
     }
     const ContactLaw& law(std::size_t k) const { return laws[law_index(k, pairs[contacts[k].pair])]; }
 
+    /// Remove all but the memory.
     void clear();
     /// Append a contact; it has the law of those of the same two objects before it, or else `laws` has to receive its own.
     /// True if so.

@@ -9,6 +9,7 @@
 #include "math/positive_part.hpp"
 #include "math/rotation.hpp"
 #include "zone/contact_assembly.hpp"
+#include "zone/contact_memory.hpp"
 #include "zone/motion_bounds.hpp"
 #include "zone/sides_of.hpp"
 
@@ -81,15 +82,14 @@ Pose pose_at(const ZoneBody& body, const Vec6& y) {
 Zone& make_zone(
     Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
     const Vec3& origin) {
-    zone.bodies.clear();
     zone.nodes.clear();
     zone.cloths.clear();
     zone.dynamic_count = 0;
-    zone.contacts.clear();
     zone.model = &model;
     zone.cloth_parameters = &cloths;
-    zone.hard = compliance == 0.0;
-    zone.compliance = zone.hard ? kDefaultCompliance : compliance;
+    zone.exact_contact = compliance == 0.0;
+    zone.compliance = zone.exact_contact ? kDefaultCompliance : compliance;
+    forget_contacts(zone);
     zone.dt = dt;
     zone.origin = origin;
     zone.ground_height = model.ground.height - origin.z();
@@ -144,18 +144,6 @@ ContactGeometry contact_geometry(
     });
 }
 
-void rescue_contacts(Zone& zone) {
-    std::vector<Pose> poses;
-    std::vector<Vec3> nodes;
-    for (const ZoneBody& body : zone.bodies) poses.push_back(body.start);
-    for (const ZoneNode& node : zone.nodes) nodes.push_back(node.start);
-    zone.contacts.split_laws();
-    for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
-        ContactRange& range = zone.contacts.laws[k].range;
-        range = rescued_range(range, contact_geometry(zone, zone.contacts[k], poses, nodes).distance);
-    }
-}
-
 Mat6 chart_jacobian(const Vec6& y) {
     Mat6 jacobian = Mat6::Identity();
     jacobian.topLeftCorner<3, 3>() = left_jacobian(y.head<3>());
@@ -183,8 +171,7 @@ void place_vertices(const Zone& zone, ZonePoint& point) {
     const FeatureVertices& vertices = zone.contacts.vertices;
     point.vertices.resize(vertices.listed.size());
     for (const auto& [body, vertex] : vertices.entries)
-        point.vertices[vertices.first[body] + vertex] =
-            point.poses[body] * zone.mesh(body).vertices[vertex];
+        point.vertices[vertices.first[body] + vertex] = point.poses[body] * zone.mesh(body).vertices[vertex];
 }
 
 double inertial_energy(const Zone& zone, const Coordinates& y) {

@@ -72,8 +72,8 @@ struct PassiveBodies {
 /// Bodies (the dynamic ones first) and the contacts that can become active.
 struct Zone {
     const Model* model = nullptr;
-    double compliance = 0.0;     ///< of the contacts; with `hard`, of the steps towards their multipliers
-    bool hard = false;           ///< contacts do not give way: Eq. 6 as written
+    double compliance = 0.0;     ///< of the contacts; of exact ones, of the first step towards their multipliers
+    bool exact_contact = false;  ///< contacts do not give way: Eq. 6 as written
     Vec3 origin = Vec3::Zero();  ///< of the zone frame, world
     double ground_height = 0.0;  ///< zone frame
     double dt = 0.0;             ///< [s]
@@ -98,16 +98,13 @@ struct Zone {
 void list_feature_vertices(Zone& zone, const ZoneContact& contact);
 
 /// Make an empty zone in the memory of another one, for bodies and cloths of a model to join: the one way to make a zone.
-/// Compliance 0 asks for hard contacts. Returns `zone`.
+/// Compliance 0 asks for exact ones. Returns `zone`.
 Zone& make_zone(
     Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
     const Vec3& origin);
 
 /// Pose of a body at its coordinates.
 Pose pose_at(const ZoneBody& body, const Vec6& y);
-
-/// Widen the range of contacts whose objects start the step next to their pole; see rescued_range.
-void rescue_contacts(Zone& zone);
 
 /// A contact below its rest distance.
 struct ActiveContact {

@@ -96,13 +96,13 @@ double contact_margins(const Model& model, const Contact& contact) {
 
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
     ContactSet& set = zone.contacts;
-    const bool own_law = a.cloth >= 0 || b.cloth >= 0 || zone.hard;
+    const bool own_law = a.cloth >= 0 || b.cloth >= 0 || zone.exact_contact;
     if (set.append(contact, a, b, own_law)) {
         const ContactRange range = contact_range(
             contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
         set.laws.push_back({range, {}});
         set.laws.back().stiffness = with_sides(zone, set[set.size() - 1], [&](const auto& side_a, const auto& side_b) {
-            return contact_stiffness(side_a.mass(), side_b.mass(), zone.compliance);
+            return contact_stiffness(side_a.mass(), side_b.mass(), zone.contacts.memory.compliance);
         });
     }
     list_feature_vertices(zone, set[set.size() - 1]);

@@ -25,7 +25,6 @@ struct Scene {
     ZonePoint point, trial;
     ContactCoverage coverage;
     BlockSystem system;
-    HardContacts hard;
     std::optional<ZonePath> path;
     std::optional<ModelDirection> direction;
     Coordinates targets;
@@ -66,7 +65,7 @@ struct Scene {
     void start() {
         targets.assign_zero(zone.bodies.size(), 0);
         point.y = targets;
-        path.emplace(zone, passive, hard, point, trial, coverage, system);
+        path.emplace(zone, passive, point, trial, coverage, system);
         path->set_to_targets(targets);
         path->list_contacts(targets);
         evaluate(zone, point);
