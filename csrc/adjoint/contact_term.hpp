@@ -1,6 +1,6 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
 namespace diffsim {
 

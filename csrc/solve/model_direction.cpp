@@ -5,7 +5,7 @@
 #include <cmath>
 #include <tuple>
 
-#include "zone/contact_assembly.hpp"
+#include "zone/contacts.hpp"
 #include "zone/motion_bounds.hpp"
 #include "zone/sides_of.hpp"
 

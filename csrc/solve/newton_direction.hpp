@@ -3,7 +3,7 @@
 #include <memory>
 
 #include "solve/cut_search.hpp"
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
 namespace diffsim {
 

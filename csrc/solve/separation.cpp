@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "solve/contact_model.hpp"
+#include "zone/contacts.hpp"
 #include "zone/sides_of.hpp"
 
 namespace diffsim {

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "zone/zone_contacts.hpp"
+#include "zone/zone_derivatives.hpp"
 
 namespace diffsim {
 

@@ -132,10 +132,10 @@ private:
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
             if (k >= zone.dynamic_count) {
-                scratch.shared.push_back({index, id, adjoint.place_gradient.bodies[k]});
+                scratch.shared.push_back({index, id, adjoint.pose_gradient.bodies[k]});
                 continue;
             }
-            m.pose_gradient[id] = adjoint.place_gradient.bodies[k];
+            m.pose_gradient[id] = adjoint.pose_gradient.bodies[k];
             m.multiplier[id] = adjoint.multiplier.bodies[k];
             m_parameter_gradient.mass[id] += adjoint.mass_gradient[k];
         }
@@ -171,15 +171,15 @@ private:
             ZoneAdjoint adjoint = zone_adjoint(zone, point, upstreams, m_options.adjoint, m_needs, workspace);
             for (int k = 0; k < model.node_count(); ++k) {
                 const int node = cloth.first_node + k;
-                adjoint.place_gradient.nodes[k] += contact.place_gradient.nodes[node];
+                adjoint.pose_gradient.nodes[k] += contact.pose_gradient.nodes[node];
                 const int id = model.first_node + k;
                 if (zone.nodes[k].pinned) {
-                    pinned_node(id, adjoint.place_gradient.nodes[k], adjoint.start_gradient[k]);
+                    pinned_node(id, adjoint.pose_gradient.nodes[k], adjoint.start_gradient[k]);
                 } else {
                     const Vec3 error = m_record.elastic_shift[id] - zone.nodes[k].target;
                     free_node(
                         cloth.id, k, adjoint.multiplier.nodes[k], error, 0.0,
-                        adjoint.place_gradient.nodes[k] + adjoint.start_gradient[k]);
+                        adjoint.pose_gradient.nodes[k] + adjoint.start_gradient[k]);
                 }
             }
             add_material(cloth.id, adjoint.cloth_gradient[0]);
@@ -192,7 +192,7 @@ private:
             const Cloth& model = m_model.cloths[cloth.id];
             for (int k = 0; k < model.node_count(); ++k) {
                 const int node = cloth.first_node + k;
-                const Vec3& place = adjoint.place_gradient.nodes[node];
+                const Vec3& place = adjoint.pose_gradient.nodes[node];
                 if (zone.nodes[node].pinned) {
                     // Their motion is given, but contacts with their features are as stiff as their mass makes them.
                     m_parameter_gradient.cloths[cloth.id].density +=

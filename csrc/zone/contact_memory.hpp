@@ -1,6 +1,6 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/zone_point.hpp"
 
 /// What changes the laws of a zone's contacts while it is solved, and lasts from list to list; see ContactMemory.
 namespace diffsim {

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "contact/contact_derivatives.hpp"
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
 namespace diffsim {
 

@@ -3,7 +3,7 @@
 #include <utility>
 
 #include "contact/sides.hpp"
-#include "zone/zone.hpp"
+#include "zone/zone_point.hpp"
 
 /// The one place that decodes what the sides of a zone's contacts are: a body, a cloth or the ground, and whether they yield.
 namespace diffsim {

@@ -3,7 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
-#include "zone/sides_of.hpp"
+#include "zone/contacts.hpp"
+#include "zone/elasticity.hpp"
 
 namespace diffsim {
 namespace {
@@ -37,33 +38,8 @@ Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double p
 
 double energy_noise(
     const Zone& zone, const ZonePoint& point, const BlockSystem& system, double position, std::vector<double>& pushed) {
-    // The errors of one body's contacts may all add up. Those of different bodies are independent: their sum grows with the
-    // root of their number.
-    double force_sum = 0.0;
-    pushed.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
-    for (const ActiveContact& active : point.active) {
-        if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
-        const ZoneContact& contact = zone.contacts[active.index];
-        const double force = normal_force(contact.law, active.geometry.distance).force;
-        bool on_body = false;
-        visit_movers(
-            zone, contact,
-            [&](int body) {
-                if (!zone.yields(body)) return;
-                pushed[body] += force;
-                on_body = true;
-            },
-            [](int) {});
-        if (!on_body) force_sum += force;
-    }
-    double square_sum = 0.0;
-    for (double force : pushed) square_sum += force * force;
-    force_sum += std::sqrt(square_sum);
-    // The elements' forces |f| = sqrt(2 k E), by Cauchy-Schwarz Σ |f| <= sqrt(2 Σk ΣE).
-    double stiffness_sum = 0.0;
-    for (int i = 0; i < zone.node_count(); ++i)
-        if (!zone.nodes[i].pinned) stiffness_sum += system.node_diagonal(i).trace();
-    force_sum += std::sqrt(2.0 * stiffness_sum * point.elastic_energy);
+    double force_sum = contact_force_sum(zone, point, pushed);
+    force_sum += elastic_force_sum(zone, point, system);
     return 1e-15 * std::abs(point.energy) + 8.0 * kEpsilon * position * force_sum;
 }
 

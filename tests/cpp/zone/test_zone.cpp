@@ -4,7 +4,9 @@
 #include <utility>
 
 #include "fixtures.hpp"
+#include "zone/chart.hpp"
 #include "zone/contact_row.hpp"
+#include "zone/contacts.hpp"
 
 using namespace diffsim;
 using fixtures::dense;

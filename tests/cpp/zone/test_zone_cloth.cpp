@@ -3,7 +3,9 @@
 #include <algorithm>
 
 #include "cloth_fixtures.hpp"
+#include "zone/chart.hpp"
 #include "zone/contact_row.hpp"
+#include "zone/contacts.hpp"
 #include "zone/sides_of.hpp"
 
 using namespace diffsim;

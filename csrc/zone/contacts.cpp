@@ -1,13 +1,105 @@
-#include "zone/contact_assembly.hpp"
+#include "zone/contacts.hpp"
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <optional>
+#include <type_traits>
 
 #include "math/positive_part.hpp"
+#include "zone/motion_bounds.hpp"
 #include "zone/sides_of.hpp"
 
 namespace diffsim {
+namespace {
+
+void sort_unique(IndexPairs& pairs) {
+    std::sort(pairs.begin(), pairs.end());
+    pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
+}
+
+/// Find the distance of a contact, and add what it pushes with.
+template <class A, class B>
+void look_at(const Zone& zone, std::size_t k, const ZoneContact& contact, const A& a, const B& b, ZonePoint& point) {
+    constexpr bool kBodyOnGround = std::is_same_v<A, SideOfBody> && std::is_same_v<B, SideOfGround>;
+    Surface surface;
+    if constexpr (kBodyOnGround) {
+        const Pose& pose = point.poses[a.body()];
+        const double height = pose.R.row(2).dot(a.mesh().vertices[a.feature().index]) + pose.t.z() - zone.ground_height;
+        point.distances[k] = height;
+        if (!(height < contact.law.range.rest)) return;
+        surface = a.surface(point.poses, point.nodes);
+    } else {
+        surface = a.surface(point);
+    }
+    // Made where it stays if it is active.
+    const ContactGeometry& geometry =
+        point.active.emplace_back(static_cast<int>(k), contact.contact, surface, b.surface(point), zone.ground_height)
+            .geometry;
+    point.distances[k] = geometry.distance;
+    if (geometry.distance < contact.law.range.rest)
+        point.contact_energy += contact_energy(geometry, contact.law);
+    else
+        point.active.pop_back();
+}
+
+}  // namespace
+
+void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSystem& system) {
+    if (zone.nodes.empty()) return;
+    IndexPairs mixed, nodes;
+    const auto couple = [&](int i, int j) {
+        if (zone.nodes[i].pinned || zone.nodes[j].pinned) return;
+        const std::pair<int, int> pair(std::min(i, j), std::max(i, j));
+        if (system.find_node_pair(pair.first, pair.second) < 0) nodes.push_back(pair);
+    };
+    for (int index : contacts) {
+        const ZoneContact& contact = zone.contacts[index];
+        if (contact.contact.with_ground()) continue;
+        std::array<int, 6> touched;
+        int count = 0, body = kNobody;
+        visit_movers(
+            zone, contact, [&](int moved) { body = moved; },
+            [&](int node) { touched[static_cast<std::size_t>(count++)] = node; });
+        for (int i = 0; i < count; ++i) {
+            const int node = touched[static_cast<std::size_t>(i)];
+            for (int j = i + 1; j < count; ++j) couple(node, touched[static_cast<std::size_t>(j)]);
+            if (zone.yields(body) && !zone.nodes[node].pinned && system.find_mixed_pair(body, node) < 0)
+                mixed.emplace_back(body, node);
+        }
+    }
+    if (mixed.empty() && nodes.empty()) return;
+    BlockPattern pattern = system.pattern();
+    const auto merge = [](IndexPairs& into, IndexPairs& more) {
+        sort_unique(more);
+        IndexPairs merged;
+        merged.reserve(into.size() + more.size());
+        std::merge(into.begin(), into.end(), more.begin(), more.end(), std::back_inserter(merged));
+        into = std::move(merged);
+    };
+    merge(pattern.mixed_pairs, mixed);
+    merge(pattern.node_pairs, nodes);
+    system.set_pattern(std::move(pattern));
+}
+
+void evaluate_contacts(const Zone& zone, ZonePoint& point, const ZonePoint* before) {
+    point.distances.resize(zone.contacts.size());
+    point.active.clear();
+    point.contact_energy = 0.0;
+    std::optional<MotionBounds> motion;
+    if (before != nullptr) motion.emplace(zone, before->y, point.y);
+    for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
+        const ZoneContact& contact = zone.contacts[k];
+        if (motion) {
+            const double at_least = before->distances[k] - motion->approach(contact);
+            if (at_least > contact.law.range.rest) {
+                point.distances[k] = at_least;
+                continue;
+            }
+        }
+        with_sides(zone, contact, [&](const auto& a, const auto& b) { look_at(zone, k, contact, a, b, point); });
+    }
+}
 
 namespace {
 
@@ -259,6 +351,31 @@ void add_contact_curvature(
     const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
     ZoneDerivatives& derivatives, BlockSystem& system) {
     Assembler(zone, point, Curvature::full, cut, derivatives, &system).run(pushing);
+}
+
+double contact_force_sum(const Zone& zone, const ZonePoint& point, std::vector<double>& pushed) {
+    // The errors of one body's contacts may all add up. Those of different bodies are independent: their sum grows with the
+    // root of their number.
+    double force_sum = 0.0;
+    pushed.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
+    for (const ActiveContact& active : point.active) {
+        if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
+        const ZoneContact& contact = zone.contacts[active.index];
+        const double force = normal_force(contact.law, active.geometry.distance).force;
+        bool on_body = false;
+        visit_movers(
+            zone, contact,
+            [&](int body) {
+                if (!zone.yields(body)) return;
+                pushed[body] += force;
+                on_body = true;
+            },
+            [](int) {});
+        if (!on_body) force_sum += force;
+    }
+    double square_sum = 0.0;
+    for (double force : pushed) square_sum += force * force;
+    return force_sum + std::sqrt(square_sum);
 }
 
 }  // namespace diffsim
