@@ -96,7 +96,8 @@ private:
             const double radius = m_zone.mesh(static_cast<int>(i)).radius;
             const auto extent = [&](const Vec6& y) { return y.tail<3>().norm() + radius * y.head<3>().norm(); };
             const double falling = extent(body.target);
-            if (falling < kShortWay * radius && extent(body.warm) < kHeld * falling) y_end.bodies[i] = body.warm;
+            if (falling < kShortWay * radius && extent(body.last_motion) < kHeld * falling)
+                y_end.bodies[i] = body.last_motion;
         }
     }
 
@@ -134,9 +135,9 @@ private:
     /// Last step's motion already respected last step's contacts: it is the natural first iterate.
     void go_to_warm_start() {
         m_w.y_end = y();
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].warm;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].last_motion;
         for (int i = 0; i < m_zone.node_count(); ++i)
-            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
+            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].last_motion;
         if (largest_move() < kEpsilon * m_path.position()) return;
         m_path.ensure_covered(m_w.y_end);
         // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and

@@ -45,7 +45,6 @@ struct ZoneWorkspace {
     ContactCoverage coverage;
     Coordinates step, y_end;
     std::vector<double> pushed;  ///< sum of the contact forces on each body
-    Box swept;
 };
 
 /// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts after

@@ -3,6 +3,8 @@
 #include <algorithm>
 
 #include "math/rotation.hpp"
+#include "step/body_step.hpp"
+#include "step/cloth_step.hpp"
 #include "zone/contact_memory.hpp"
 #include "zone/zone_contacts.hpp"
 
@@ -78,7 +80,8 @@ void RecordedZones::join_body(ZoneMemory& memory, std::vector<int>& local, int i
     ZoneBody body;
     body.id = id;
     if (m_model.bodies[id].is_dynamic())
-        body = moving_body(id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
+        body = moving_body(
+            {m_model, m_parameters, m_options.dt}, id, state, m_control.bodies[id], m_record.free_rotation[id]);
     else
         body.start = {quaternion_to_matrix(state.orientation), state.position};
     body.start.t -= memory.zone.origin;

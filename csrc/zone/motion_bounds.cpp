@@ -8,6 +8,11 @@ double motion_bound(const Vec6& change, double radius) {
     return change.tail<3>().norm() + std::min(change.head<3>().norm(), 2.0) * radius;
 }
 
+double sagitta(const Vec6& change, double radius) {
+    const double angle = change.head<3>().norm();
+    return radius * std::min(0.125 * angle * angle, 2.0);
+}
+
 Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end) {
     Vec3 sum = Vec3::Zero();
     for (int i = cloth.first_node; i < cloth.first_node + count; ++i) sum += end.nodes[i] - begin.nodes[i];

@@ -8,6 +8,9 @@ namespace diffsim {
 /// How far a vertex of a body at most moves when the body's coordinates change by this much, chord or arc.
 double motion_bound(const Vec6& change, double radius);
 
+/// Bound on how far the arc of a vertex leaves its chord over this turn.
+double sagitta(const Vec6& change, double radius);
+
 /// Mean motion of a cloth's nodes between two places.
 Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end);
 

@@ -24,7 +24,7 @@ struct ZoneBody {
     Mat3 inverse_inertia = Mat3::Zero();
     double mass = kInfinity;     ///< infinite for bodies that do not yield
     Vec6 target = Vec6::Zero();  ///< ŷ: where a dynamic body goes when nothing touches it, a kinematic one is driven
-    Vec6 warm = Vec6::Zero();    ///< last step's motion: dt (w0, v0)
+    Vec6 last_motion = Vec6::Zero();  ///< last step's motion: dt (w0, v0)
 };
 
 /// M p
@@ -44,9 +44,9 @@ inline Vec6 inverse_mass_times(const ZoneBody& body, const Vec6& p) {
 struct ZoneNode {
     Vec3 start = Vec3::Zero();  ///< at the start of the step, zone frame
     double mass = 0.0;
-    bool pinned = false;         ///< moves to its target whatever happens
-    Vec3 target = Vec3::Zero();  ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
-    Vec3 warm = Vec3::Zero();    ///< last step's motion: dt v0
+    bool pinned = false;              ///< moves to its target whatever happens
+    Vec3 target = Vec3::Zero();       ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
+    Vec3 last_motion = Vec3::Zero();  ///< last step's motion: dt v0
 };
 
 /// A cloth; all its nodes are in the zone.

@@ -22,14 +22,14 @@ Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double p
         const ZoneBody& body = zone.bodies[i];
         const Vec6& g = derivatives.gradient.bodies[i];
         residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
-        reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
+        reference = std::max(reference, scaled(body.inertia, body.mass, body.last_motion - body.target));
     }
     for (int i = 0; i < zone.node_count(); ++i) {
         const ZoneNode& node = zone.nodes[i];
         if (node.pinned) continue;
         const double root_mass = std::sqrt(node.mass);
         residual = std::max(residual, derivatives.gradient.nodes[i].norm() / root_mass);
-        reference = std::max(reference, (node.warm - node.target).norm() * root_mass);
+        reference = std::max(reference, (node.last_motion - node.target).norm() * root_mass);
     }
     // Nothing pushes here and nothing did before: only the exact answer will do, or a step lost in rounding.
     if (!(reference > 0.0)) return {residual > 0.0 ? 1.0 : 0.0, 0.0};

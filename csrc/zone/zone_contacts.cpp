@@ -14,12 +14,6 @@ constexpr double kRoom = 0.05;     // of its thickness: room on all sides of a b
 constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
 
-/// Bound on how far the arc of a vertex leaves its chord over this turn.
-double sagitta(const Vec6& change, double radius) {
-    const double angle = change.head<3>().norm();
-    return radius * std::min(0.125 * angle * angle, 2.0);
-}
-
 SweptMesh swept_mesh(const Zone& zone, int body, const Vec6& begin, const Vec6& end, double slack) {
     const ZoneBody& b = zone.bodies[body];
     return {&zone.mesh(body), {pose_at(b, begin), pose_at(b, end)}, zone.model->bodies[b.id].margin + slack};

@@ -58,7 +58,8 @@ TEST(bodies_held_by_something_list_no_neighbours_that_only_falling_would_bring_n
     CHECK(held.listed_pairs() == 0);
 
     Cubes falling(true);
-    for (ZoneBody& body : falling.zone.bodies) body.warm[5] = -kFall;  // as if it had moved so far in the last step
+    for (ZoneBody& body : falling.zone.bodies)
+        body.last_motion[5] = -kFall;  // as if it had moved so far in the last step
     CHECK(falling.solve().status == ZoneStatus::converged);
     CHECK_NEAR(falling.workspace.point.y.bodies[0], held.workspace.point.y.bodies[0], 1e-12);
 }
