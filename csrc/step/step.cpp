@@ -62,7 +62,6 @@ public:
         const SceneControl& control, StepWorkspace& workspace, StepInfo& info)
         : m_model(model),
           m_options(options),
-          m_parameters(parameters),
           m_state(state),
           m_control(control),
           m_workspace(workspace),
@@ -383,7 +382,6 @@ private:
 
     const Model& m_model;
     const Options& m_options;
-    const Parameters& m_parameters;
     const SceneState& m_state;
     const SceneControl& m_control;
     StepWorkspace& m_workspace;
