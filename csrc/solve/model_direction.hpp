@@ -4,6 +4,7 @@
 #include "solve/cut_search.hpp"
 #include "solve/zone_path.hpp"
 
+/// The direction of a zone far from its solution.
 namespace diffsim {
 
 /// The direction of a zone far from its solution: the minimiser of one convex model of all near contacts, linearised again

@@ -2,6 +2,7 @@
 
 #include "zone/zone_point.hpp"
 
+/// Multipliers of exact contacts.
 namespace diffsim {
 
 /// Rounds of the method of multipliers, for a zone of exact contacts: after each, the rest distance of every contact is shifted

@@ -5,6 +5,7 @@
 #include "solve/cut_search.hpp"
 #include "zone/zone_derivatives.hpp"
 
+/// The direction of a zone near its solution.
 namespace diffsim {
 
 /// Newton steps of a zone, one after the other, and the factor that the last of them came from.

@@ -5,6 +5,7 @@
 #include "solve/impact_gate.hpp"
 #include "zone/zone_contacts.hpp"
 
+/// Ways of a zone, and the contacts that are listed for them.
 namespace diffsim {
 
 /// Where a zone may go from its current point: the list of its contacts is made complete for the ways that are asked about,

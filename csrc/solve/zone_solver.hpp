@@ -6,6 +6,7 @@
 #include "zone/zone_contacts.hpp"
 #include "zone/zone_derivatives.hpp"
 
+/// The minimisation of a zone's energy over one step.
 namespace diffsim {
 
 class Interrupt;

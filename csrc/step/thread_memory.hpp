@@ -5,6 +5,7 @@
 #include "adjoint/adjoint.hpp"
 #include "step/step.hpp"
 
+/// What each thread of a step keeps to itself.
 namespace diffsim {
 
 /// A kinematic body that did not reach its target.

@@ -2,6 +2,7 @@
 
 #include "zone/zone_point.hpp"
 
+/// The listing of the contacts that a motion of a zone may bring about, and how far a motion may go.
 namespace diffsim {
 
 /// Which part of its motion a zone's list of contacts is complete for: all coordinates within `slack` of the segment
