@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from . import diagnostics, rotation, shapes
+from . import diagnostics, parameters, rotation, shapes
 from ._units import UnitsWarning
+from .contacts import Contacts
 from .materials import ClothMaterial
 from .ops import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from .scene import BodyHandle, ClothHandle, Scene
@@ -14,6 +15,7 @@ __all__ = [
     "BodyHandle",
     "ClothHandle",
     "ClothMaterial",
+    "Contacts",
     "Control",
     "ConvergenceWarning",
     "Failure",
@@ -26,6 +28,7 @@ __all__ = [
     "State",
     "UnitsWarning",
     "diagnostics",
+    "parameters",
     "rotation",
     "shapes",
 ]

@@ -103,14 +103,31 @@ def check_state(where: str, state: Any, body_count: int, node_count: int) -> int
     return batch
 
 
-def check_control(
-    where: str, control: Any, dtype: torch.dtype, body_count: int, node_count: int, batch: int | None
-) -> int | None:
-    """The control fits the scene and the state's dtype and batch size. Returns the batch size known now."""
+def check_placing(where: str, name: str, value: Any, width: int, state: State) -> Tensor | None:
+    """Where something is to be put: a tensor, or numbers that make one, of shape (..., width), in the state's dtype."""
+    if value is None:
+        return None
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.as_tensor(value, dtype=state.dtype, device="cpu")
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(message(where, name, f"be a torch.Tensor or {width} numbers", repr(value))) from error
+    tensor = check_float_tensor(where, name, value)
+    if tensor.ndim == 0 or tensor.shape[-1] != width:
+        raise ValueError(message(where, name, f"have shape (..., {width})", tuple(tensor.shape)))
+    if width == 4 and not torch._C._are_functorch_transforms_active():
+        length = torch.linalg.vector_norm(tensor.detach(), dim=-1)
+        if not ((length > 1e-6) & length.isfinite()).all():
+            raise ValueError(message(where, name, "be quaternions w, x, y, z other than zero", tensor.tolist()))
+    return tensor
+
+
+def check_control(where: str, control: Any, body_count: int, node_count: int, batch: int | None) -> int | None:
+    """The control fits the scene and the state's batch size. Returns the batch size known now."""
     check_instance(where, "control", control, Control, "be a diffsim.Control or None")
     for name, value in control.__dict__.items():
         if value is not None:
-            tensor = check_float_tensor(where, f"control.{name}", value, dtype)
+            tensor = check_float_tensor(where, f"control.{name}", value)
             count = node_count if name.startswith("node") else body_count
             batch = check_shape(where, f"control.{name}", tensor, (count, 3), batch)
     return batch

@@ -1,7 +1,7 @@
-"""Energies, momenta and frames of a state, as differentiable torch expressions, float64 inside.
+"""Energies, momenta and frames of a state, and bodies put by their frames, as differentiable torch expressions.
 
-Mass and inertia of static and kinematic bodies are zero, as is `node_mass` (n_nodes,) [kg] of pinned nodes, so that
-sums are over what moves freely. Without cloth `node_mass` is None.
+All are float64 inside. Mass and inertia of static and kinematic bodies are zero, as is `node_mass` (n_nodes,) [kg] of
+pinned nodes, so that sums are over what moves freely. Without cloth `node_mass` is None.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .rotation import to_matrix
+from .rotation import rotate, to_matrix
 from .state import State
 
 _F64 = torch.float64
@@ -70,6 +70,32 @@ def mesh_transform(state: State, mesh_offset: Tensor) -> Tensor:
     R = to_matrix(state.orientation.to(_F64))
     origin = state.position.to(_F64) - (R @ mesh_offset.unsqueeze(-1)).squeeze(-1)
     return _frames(R, origin).to(state.dtype)
+
+
+def placed(
+    state: State,
+    body: int,
+    mesh_offset: Tensor,
+    leading: torch.Size,
+    position: Tensor | None,
+    orientation: Tensor | None,
+) -> State:
+    """The state, with these leading axes, in which the mesh's frame of one body is at position and orientation; None
+    keeps what there is. `mesh_offset`: its centre of mass in that frame, (3,).
+    """
+    q, center = state.orientation[..., body, :].to(_F64), state.position[..., body, :].to(_F64)
+    origin = center - rotate(q, mesh_offset) if position is None else position.to(_F64)
+    rows: dict[str, Tensor] = {}
+    if orientation is not None:
+        q = orientation.to(_F64)
+        q = rows["orientation"] = q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+    rows["position"] = origin + rotate(q, mesh_offset)
+    fields = {name: t.expand(*leading, *t.shape[-2:]) for name, t in state.__dict__.items()}
+    for name, row in rows.items():
+        old = fields[name]
+        new = row.to(state.dtype).expand(*leading, row.shape[-1]).unsqueeze(-2)
+        fields[name] = torch.cat([old[..., :body, :], new, old[..., body + 1 :, :]], dim=-2)
+    return State._make(**fields)
 
 
 def world_vertices(state: State, vertices: Tensor, body_of_vertex: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from ._check import (
     CONTROL_FIELDS,
     STATE_FIELDS,
     check_control,
+    check_count,
     check_float_tensor,
     check_instance,
     check_shape,
@@ -25,22 +26,29 @@ Controls = Control | Sequence[Control] | None
 #: Of the operator: 6 of the state, 6 of the control, 8 parameters; those of cloth are None in a scene without.
 Inputs = tuple[Tensor | None, ...]
 
+
+class CheckedInputs(NamedTuple):
+    """What a call hands to the operator."""
+
+    inputs: Inputs
+    controls_have_time: bool
+    single: bool  #: whether an input came in float32, so that its gradient will be
+
+
 _NOT_DRIVEN = (None,) * 6  # the controls, in the order of the operator
 
 
 def plain_inputs(
     state: Any,
     control: Any,
-    mass: Tensor,
-    inertia: Tensor,
-    gravity: Tensor,
+    parameters: Mapping[str, Tensor],
     state_shapes: tuple[torch.Size, torch.Size, torch.Size],
-    parameter_shapes: tuple[torch.Size, torch.Size, torch.Size],
+    parameter_shapes: Mapping[str, torch.Size],
 ) -> Inputs | None:
     """The operator's inputs in a scene without cloth if nothing has to be converted or complained about; else None.
 
     Kept fast: it is a good part of what a small step costs in Python. The shapes are those without a batch axis, of
-    position, orientation and nodes, and of mass, inertia and gravity.
+    position, orientation and nodes, and of the parameters.
     """
     if type(state) is not State:
         return None
@@ -48,13 +56,13 @@ def plain_inputs(
     vector, quaternion, nodes = state_shapes
     position, orientation = state.position, state.orientation
     velocity, angular_velocity = state.velocity, state.angular_velocity
+    mass, inertia, gravity = parameters["mass"], parameters["inertia"], parameters["gravity"]
     try:
         if position.shape != vector:
             if position.ndim != 3:
                 return None
             batch = position.shape[0]
             vector, quaternion, nodes = (torch.Size((batch, *shape)) for shape in state_shapes)
-        mass_shape, inertia_shape, gravity_shape = parameter_shapes
         if not (
             position.dtype is f64
             and orientation.dtype is f64
@@ -67,9 +75,9 @@ def plain_inputs(
             and orientation.shape == quaternion
             and velocity.shape == vector
             and angular_velocity.shape == vector
-            and mass.shape == mass_shape
-            and inertia.shape == inertia_shape
-            and gravity.shape == gravity_shape
+            and mass.shape == parameter_shapes["mass"]
+            and inertia.shape == parameter_shapes["inertia"]
+            and gravity.shape == parameter_shapes["gravity"]
             and position.is_cpu
             and orientation.is_cpu
             and velocity.is_cpu
@@ -104,7 +112,7 @@ def checked_inputs(
     steps: int | None,
     body_count: int,
     node_count: int,
-) -> tuple[Inputs, bool]:
+) -> CheckedInputs:
     """The operator's inputs from anything that is allowed, or an error that says why not.
 
     Args:
@@ -115,7 +123,6 @@ def checked_inputs(
         steps: Of the rollout; None for a step.
         body_count: n_bodies.
         node_count: n_nodes.
-    Returns: The inputs, and whether the controls among them have a time axis.
     """
     batch = check_state(where, state, body_count, node_count)
     now = [None if _unused(name, node_count) else getattr(state, name) for name in STATE_FIELDS]
@@ -125,11 +132,20 @@ def checked_inputs(
     driven: list[Tensor | None] = [None] * len(CONTROL_FIELDS)
     has_time = False
     if steps is not None:
-        driven, has_time, batch = over_time(where, controls, steps, state.dtype, body_count, node_count, batch)
+        driven, has_time, batch = over_time(where, controls, steps, body_count, node_count, batch)
     elif controls is not None:
-        check_control(where, controls, state.dtype, body_count, node_count, batch)
+        check_control(where, controls, body_count, node_count, batch)
         driven = [None if _unused(name, node_count) else getattr(controls, name) for name in CONTROL_FIELDS]
-    return tuple(None if t is None else t.to(torch.float64) for t in (*now, *driven, *checked)), has_time
+    inputs = tuple(None if t is None else t.to(torch.float64) for t in (*now, *driven, *checked))
+    return CheckedInputs(inputs, has_time, _has_single(state, controls, parameters))
+
+
+def _has_single(state: State, controls: Any, parameters: Mapping[str, tuple[Tensor, Any]]) -> bool:
+    """Whether any tensor is float32. All are known to be right."""
+    each = controls if isinstance(controls, Sequence) else [] if controls is None else [controls]
+    driving = (t for control in each for t in control.__dict__.values())
+    tensors = (*state.__dict__.values(), *driving, *(value for value, _ in parameters.values()))
+    return any(t is not None and t.dtype is torch.float32 for t in tensors)
 
 
 def _unused(name: str, node_count: int) -> bool:
@@ -138,19 +154,19 @@ def _unused(name: str, node_count: int) -> bool:
 
 
 def over_time(
-    where: str, controls: Any, steps: int, dtype: torch.dtype, body_count: int, node_count: int, batch: int | None
+    where: str, controls: Any, steps: int, body_count: int, node_count: int, batch: int | None
 ) -> tuple[list[Tensor | None], bool, int | None]:
     """The controls in the order of the core; whether they have a time axis; the batch size known now."""
     if controls is None:
         return [None] * len(CONTROL_FIELDS), False, batch
     if isinstance(controls, Sequence) and not isinstance(controls, (str, bytes)):
-        return _stacked(where, controls, steps, dtype, body_count, node_count, batch)
+        return _stacked(where, controls, steps, body_count, node_count, batch)
     check_instance(where, "controls", controls, Control, "be None, a diffsim.Control or a sequence of them")
     arranged: dict[str, tuple[Tensor | None, bool]] = {}
     for name, value in controls.__dict__.items():
         arranged[name] = None, False
         if value is not None:
-            tensor = check_float_tensor(where, f"controls.{name}", value, dtype)
+            tensor = check_float_tensor(where, f"controls.{name}", value)
             shape = (node_count if name.startswith("node") else body_count, 3)
             tensor, has_time, batch = _arranged(where, f"controls.{name}", tensor, steps, shape, batch)
             if not _unused(name, node_count):
@@ -196,7 +212,6 @@ def _stacked(
     where: str,
     controls: Sequence[Any],
     steps: int,
-    dtype: torch.dtype,
     body_count: int,
     node_count: int,
     batch: int | None,
@@ -204,7 +219,7 @@ def _stacked(
     if len(controls) != steps:
         raise ValueError(message(where, "controls", f"have one entry per step, {steps}", len(controls)))
     for step, control in enumerate(controls):
-        batch = check_control(f"{where}: controls[{step}]", control, dtype, body_count, node_count, batch)
+        batch = check_control(f"{where}: controls[{step}]", control, body_count, node_count, batch)
     stacked: list[Tensor | None] = []
     for name in CONTROL_FIELDS:
         column = [None if _unused(name, node_count) else getattr(control, name) for control in controls]
@@ -216,9 +231,31 @@ def _stacked(
                     f"{where}: controls[{step}].{name} is None, others are not; give it in all steps or none"
                 )
             count = node_count if name.startswith("node") else body_count
-            column = [torch.zeros(count, 3, dtype=dtype, device="cpu") if t is None else t for t in column]
-        stacked.append(torch.stack(torch.broadcast_tensors(*column)) if given else None)
+            column = [torch.zeros(count, 3, device="cpu") if t is None else t for t in column]
+        cast = [t.to(torch.float64) for t in column if t is not None]  # steps may differ in their dtype
+        stacked.append(torch.stack(torch.broadcast_tensors(*cast)) if given else None)
     return stacked, any(t is not None for t in stacked), batch
+
+
+def checked_parameters(where: str, parameters: Any, shapes: Mapping[str, tuple[int, ...]]) -> Mapping[str, Tensor]:
+    """What is to take the place of parameters in a call: known names, tensors of the right shapes or batches of it."""
+    check_instance(where, "parameters", parameters, Mapping, "be a mapping of names to tensors or None")
+    batch: int | None = None
+    for name, value in parameters.items():
+        if name not in shapes:
+            raise ValueError(message(where, "parameters", f"have names among {', '.join(shapes)}", repr(name)))
+        label = f"parameters[{name!r}]"
+        batch = check_shape(where, label, check_float_tensor(where, label, value), shapes[name], batch)
+    return parameters  # type: ignore[no-any-return]
+
+
+def checked_steps(where: str, steps: Any, controls: Any) -> int:
+    """The number of steps of a rollout."""
+    if steps is None and isinstance(controls, Sequence):
+        steps = len(controls)
+    if steps is None:
+        raise TypeError(message(where, "steps", "be given, as in sim.rollout(state, steps=100)", None))
+    return check_count(where, "steps", steps)
 
 
 def _parameters(

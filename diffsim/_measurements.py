@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from . import _core, _energies
-from ._check import check_instance, check_state
+from ._check import check_instance, check_placing, check_state, message
 from ._cloth_energy import ClothElements, elastic_energy, node_mass
 from ._handles import BodyHandle, ClothHandle
 from ._packed import PackedScene
@@ -208,6 +208,49 @@ class Measurements(nn.Module):
         shift, turn, node_shift = (torch.from_numpy(t).to(state.dtype) for t in self._for_each_scene(changes, state))
         moved = state.replace(position=state.position + shift, orientation=state.orientation + turn)
         return moved.replace(node_position=state.node_position + node_shift) if self._node_count else moved
+
+    def place(
+        self,
+        state: State,
+        handle: SupportsIndex,
+        *,
+        position: Tensor | Sequence[float] | None = None,
+        orientation: Tensor | Sequence[float] | None = None,
+    ) -> State:
+        """The state with one body at another place, told as `Scene.add_body` is: by the frame of its mesh.
+
+        The inverse of `mesh_transform`: `state.position` is the centre of mass, which turns about the mesh's origin.
+        Velocities stay, and so do all other objects; `separate` moves what comes too near.
+
+        Args:
+            state: With any leading axes (...).
+            handle: As returned by `add_body`, or the index of a body.
+            position: Of the origin of the mesh, world [m], shape (..., 3). Default: where it is.
+            orientation: Quaternion w, x, y, z, mesh to world, shape (..., 4), of any length but zero; it is normalised.
+                Default: as it is.
+        Returns: The state in its dtype, with the leading axes of state, position and orientation, broadcast.
+        Raises: TypeError, ValueError for a state that is not one of this scene, a handle of another scene or of a
+            cloth, shapes that do not fit, a quaternion that is zero or not finite (inside a transform of torch.func the
+            next step finds it); IndexError for a body there is not.
+        Gradients: with respect to the state, the position and the orientation.
+        """
+        where = "place"
+        self._check_state(where, state)
+        body = self._object(where, handle)
+        if body >= self._body_count:
+            nodes = "state.replace(node_position=...)"
+            raise ValueError(f"{where}: handle must be of a body, got {handle!r}; move the nodes of a cloth by {nodes}")
+        new = {"position": position, "orientation": orientation}
+        given = {k: check_placing(where, k, v, 4 if k == "orientation" else 3, state) for k, v in new.items()}
+        leading = [t.shape[:-1] for t in given.values() if t is not None]
+        try:
+            axes = torch.broadcast_shapes(*leading, *(t.shape[:-2] for t in state.__dict__.values()))
+        except RuntimeError:
+            shapes = ", ".join(f"{k} {tuple(t.shape)}" for k, t in given.items() if t is not None)
+            got = f"{shapes} and a state of leading axes {tuple(state.leading_shape)}"
+            raise ValueError(message(where, "leading axes", "broadcast with those of the state", got)) from None
+        center = torch.from_numpy(self._packed.mesh_offset[body])
+        return _energies.placed(state, body, center, axes, given["position"], given["orientation"])
 
     def _separated_from(
         self, position: np.ndarray, orientation: np.ndarray, node_position: np.ndarray

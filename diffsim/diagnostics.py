@@ -259,7 +259,7 @@ def contact_systems(sim: Simulator, state: State, control: Control | None = None
     where = "contact_systems"
     check_instance(where, "sim", sim, Simulator, "be a diffsim.Simulator")
     with torch.no_grad():
-        inputs, _ = sim._checked_inputs(where, state, control, None)
+        inputs = sim._checked_inputs(where, state, control, None).inputs
         arrays = [None if t is None else t.contiguous().numpy(force=True) for t in inputs]
     if state.leading_shape or any(t is not None and t.ndim > 2 for t in inputs[6:12]):
         raise ValueError(f"{where}: state and control must have no batch axis")
@@ -292,7 +292,7 @@ def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps:
     else:
         batch = start.leading_shape[0] if start.leading_shape else None
         counts = len(sim.body_names), sim._node_count
-        given = dict(zip(CONTROL_FIELDS, over_time(where, controls, steps, state.dtype, *counts, batch)[0]))
+        given = dict(zip(CONTROL_FIELDS, over_time(where, controls, steps, *counts, batch)[0]))
     inputs.update({_CONTROL_NAMES[k]: t.detach().to(torch.float64) for k, t in given.items() if t is not None})
     inputs.update({name: getattr(sim, name).detach().to(torch.float64) for name in parameters})
     return {name: t for name, t in inputs.items() if t.numel()}  # without bodies there is nothing to move of them

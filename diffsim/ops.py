@@ -112,7 +112,7 @@ class SolverError(RuntimeError):
 
 
 class GradientError(RuntimeError):
-    """A backward gave numbers that are not finite (or, with a float32 state, too large for that) from finite ones.
+    """A backward gave numbers that are not finite (or, with a float32 input, too large for that) from finite ones.
 
     Attributes:
         scene: Index along the batch axis, 0 without one; -1 if only the sum over steps and scenes is not finite.
@@ -178,7 +178,7 @@ class RolloutCall:
         keep_tape: Whether the backward finds a record; without, it runs the forward again (checkpointing).
         want_signature: Whether `signature` is to be filled in.
         first_step: How many steps other calls made before, for error messages.
-        single: Whether gradients must fit into single precision, where a float32 state will have them.
+        single: Whether gradients must fit into single precision, where a float32 input will have them.
 
     Attributes:
         info: Statistics, after the call.

@@ -15,12 +15,15 @@ unit quaternions.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = TypeVar("Array", Tensor, NDArray[np.float64])
 
@@ -63,6 +66,35 @@ def exp(rotation_vector: Array) -> Array:
 def log(q: Array) -> Array:
     """The shortest rotation vector [rad], shape (..., 3), of q / |q|. Smooth but for rotations by π."""
     return _apply(_log, q)
+
+
+def from_xyzw(q: Array) -> Array:
+    """The same quaternion, shape (..., 4), given in the order x, y, z, w: that of Warp, Newton, scipy and ROS."""
+    return _apply(lambda q: q.roll(1, -1), q)
+
+
+def to_xyzw(q: Array) -> Array:
+    """The same quaternion, shape (..., 4), in the order x, y, z, w: that of Warp, Newton, scipy and ROS."""
+    return _apply(lambda q: q.roll(-1, -1), q)
+
+
+def from_scipy(rotation: Rotation) -> NDArray[np.float64]:
+    """The quaternions w, x, y, z, w >= 0, of scipy's rotations; shape (4,) or (k, 4), as they are one or many."""
+    return np.asarray(from_xyzw(np.asarray(rotation.as_quat(canonical=True))))
+
+
+def to_scipy(q: Tensor | NDArray[np.float64]) -> Rotation:
+    """Scipy's rotation, or rotations, of q / |q|, shape (4,) or (k, 4); newer versions of scipy take more axes.
+
+    Raises: ImportError where scipy is not installed; what scipy raises for quaternions of length zero.
+    Gradients: none.
+    """
+    try:
+        from scipy.spatial.transform import Rotation
+    except ImportError as error:
+        raise ImportError("rotation.to_scipy needs scipy: pip install 'mesh-diffsim[scipy]'", name="scipy") from error
+    values = q.numpy(force=True) if isinstance(q, Tensor) else q
+    return Rotation.from_quat(to_xyzw(np.asarray(values)))
 
 
 def from_rpy(rpy: Array) -> Array:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from . import _core
 from ._check import (
@@ -20,11 +21,21 @@ from ._check import (
 from ._cloth_energy import cloth_elements
 from ._description import description
 from ._identity import SceneIdentity
-from ._inputs import Controls, Inputs, check_unused, checked_inputs, plain_inputs, state_from
+from ._inputs import (
+    CheckedInputs,
+    Controls,
+    check_unused,
+    checked_inputs,
+    checked_parameters,
+    checked_steps,
+    plain_inputs,
+    state_from,
+)
 from ._measurements import Measurements
 from ._outcome import combined, failure_text, warn_of_failure, warn_of_fast_impacts
 from ._packed import PackedScene, core_model
 from ._progress import progress_bar
+from .contacts import Contacts, contacts_from
 from .ops import Info, RolloutCall, SolverError, rollout
 from .scene import Scene
 from .state import Control, State
@@ -44,10 +55,10 @@ class Simulator(SceneIdentity, Measurements):
     distance (Eqs. 2 and 6 of Qiao et al., ICML 2020, as one problem).
 
     Physical parameters are parameters of the module, float64, with ``requires_grad=False`` until asked for, and can be
-    exchanged for a call by `torch.func.functional_call`: `mass` (n_bodies,) [kg], `inertia` (n_bodies, 3, 3) in body
-    axes [kg·m²], `gravity` (3,) [m/s²], `friction` and `restitution` (n_objects,), and per cloth `cloth_density`,
-    `cloth_stretch`, `cloth_shear`, `cloth_bend`, `cloth_damping` (n_cloths,), in the units of `ClothMaterial`. Mass and
-    inertia of static and kinematic bodies are zero and are not read.
+    exchanged for a call by its ``parameters=`` or by `torch.func.functional_call`: `mass` (n_bodies,) [kg], `inertia`
+    (n_bodies, 3, 3) in body axes [kg·m²], `gravity` (3,) [m/s²], `friction` and `restitution` (n_objects,), and per
+    cloth `cloth_density`, `cloth_stretch`, `cloth_shear`, `cloth_bend`, `cloth_damping` (n_cloths,), in the units of
+    `ClothMaterial`. Mass and inertia of static and kinematic bodies are zero and are not read.
 
     Args:
         scene: Read now; later changes to it have no effect.
@@ -167,9 +178,10 @@ class Simulator(SceneIdentity, Measurements):
         n = self._body_count = len(p.names)
         self._node_count = len(p.node_rest)
         self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
-        self._parameter_shapes = torch.Size((n,)), torch.Size((n, 3, 3)), torch.Size((3,))
-        self._object_shape = p.friction.shape
+        names = (*PARAMETERS, "friction", "restitution", *CLOTH_PARAMETERS)
+        self._parameter_shapes = {name: torch.Size(getattr(p, name).shape) for name in names}
         self._object_names = (*p.names, *p.cloth_names)
+        self._cloth_of_node = torch.from_numpy(np.repeat(np.arange(len(p.node_count)), p.node_count))
         self._separated: tuple[np.ndarray, ...] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -240,32 +252,35 @@ class Simulator(SceneIdentity, Measurements):
 
     # ---- stepping ----------------------------------------------------------------------------------------------------
 
-    def forward(self, state: State, control: Control | None = None) -> State:
+    def forward(
+        self, state: State, control: Control | None = None, *, parameters: Mapping[str, Tensor] | None = None
+    ) -> State:
         """One time step; differentiable with respect to the state, the control, `mass`, `inertia`, `gravity` and the
         parameters of cloth.
 
         Args:
             state: Of one dtype, float32 or float64, with or without a batch axis (of size B) in front of any tensor.
-            control: Of the state's dtype, each tensor with or without a batch axis. Default: no forces, kinematic
-                bodies go on as they move, and pinned nodes stand still.
+            control: Each tensor float32 or float64, whatever the state is, with or without a batch axis. Default: no
+                forces, kinematic bodies go on as they move, and pinned nodes stand still.
+            parameters: Takes the place of parameters of the module in this call, by their names: ``{"mass": m}``, each
+                float32 or float64, with or without a batch axis in front of its shape: one value per scene.
         Returns: The state one `dt` later, in the state's dtype; with a batch axis if any input has one.
         Raises:
             TypeError, ValueError: Wrong type, dtype, device or shape; values that are not finite; quaternions further
-                than 1e-3 from length 1; objects that touch, cross or are in the ground. The message names object, field
-                and value.
+                than 1e-3 from length 1; objects that touch, cross or are in the ground; a parameter there is not. The
+                message names object, field and value.
             SolverError: A step did not converge, if ``on_failure="raise"``.
         Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
         """
-        inputs = None
+        values = self._values("Simulator", parameters)
+        inputs, single = None, False
         if not self._node_count:
-            shapes = self._state_shapes, self._parameter_shapes
-            inputs = plain_inputs(state, control, self.mass, self.inertia, self.gravity, *shapes)
+            inputs = plain_inputs(state, control, values, self._state_shapes, self._parameter_shapes)
         if inputs is None:  # anything but float64 tensors in the plainest shapes
-            inputs, _ = self._checked_inputs("Simulator", state, control, None)
+            inputs, _, single = self._checked_inputs("Simulator", state, control, None, values)
         if self._check:
-            self._check_unused_parameters()
+            self._check_unused_parameters(values)
         threads = self._num_threads or torch.get_num_threads()
-        single = state.position.dtype is torch.float32
         call = RolloutCall(self._model, self._options, 1, threads, single=single)
         outputs = rollout(call, *inputs)  # type: ignore[arg-type]
         result = state_from(outputs, state)
@@ -275,10 +290,12 @@ class Simulator(SceneIdentity, Measurements):
     def rollout(
         self,
         state: State,
-        controls: Controls,
-        steps: int,
+        controls: Controls = None,
+        steps: int | None = None,
         checkpoint_every: int | None = None,
         progress: bool = False,
+        *,
+        parameters: Mapping[str, Tensor] | None = None,
     ) -> State:
         """Many time steps: the loop over them, forward and backward, runs in C++.
 
@@ -290,37 +307,40 @@ class Simulator(SceneIdentity, Measurements):
                 With a state of batch size B, (B, n, 3) is constant and (steps, n, 3) the same for all scenes. If B
                 equals steps, axes of that size cannot be told apart, and the error says how to write what is meant; a
                 sequence always works: ``list(controls)``, where the first axis is time.
-            steps: Number of steps.
+            steps: Number of steps: ``sim.rollout(state, steps=100)``. Default: the length of a sequence of controls.
             checkpoint_every: Keep the record gradients need only for this many steps at a time, k, and compute it again
                 in the backward: memory O(steps / k + k), about one more forward in time, the same values bit by bit.
             progress: Show a progress bar on stderr.
+            parameters: As for one step, the same in all of them.
         Returns: State with a leading time axis: after the first step, ..., after the last. Its tensors have shapes
             (steps[, B], n, 3), with a batch axis if any input has one.
         Raises: As for one step.
         Gradients: As for one step. A float32 rollout is float64 throughout and rounded once, at the end.
         """
-        return self._rollout(state, controls, steps, checkpoint_every, progress)[0]
+        return self._rollout(state, controls, steps, checkpoint_every, progress, parameters)[0]
 
     def _rollout(
         self,
         state: State,
         controls: Controls,
-        steps: int,
+        steps: int | None,
         checkpoint_every: int | None = None,
         progress: bool = False,
+        parameters: Mapping[str, Tensor] | None = None,
         want_signature: bool = False,
     ) -> tuple[State, np.ndarray | None]:
         where = "rollout"
-        steps = check_count(where, "steps", steps)
+        steps = checked_steps(where, steps, controls)
         every = steps if checkpoint_every is None else check_count(where, "checkpoint_every", checkpoint_every)
         length = every
         if progress and checkpoint_every is None:
             length = max(1, steps // _PROGRESS_UPDATES)
-        inputs, has_time = self._checked_inputs(where, state, controls, steps)
+        values = self._values(where, parameters)
+        inputs, has_time, single = self._checked_inputs(where, state, controls, steps, values)
         if self._check:
-            self._check_unused_parameters()
+            self._check_unused_parameters(values)
         threads = self._num_threads or torch.get_num_threads()
-        now, driven, parameters = inputs[:6], inputs[6:12], inputs[12:]
+        now, driven, constant = inputs[:6], inputs[6:12], inputs[12:]
         segments, infos, signatures = [], [], []
         with progress_bar(steps, progress) as advance:
             for start in range(0, steps, length):
@@ -335,12 +355,12 @@ class Simulator(SceneIdentity, Measurements):
                     keep_tape=checkpoint_every is None or steps <= every,
                     want_signature=want_signature,
                     first_step=start,
-                    single=state.dtype is torch.float32,
+                    single=single,
                 )
                 part = driven
                 if has_time and count < steps:
                     part = tuple(None if t is None else t[start : start + count] for t in driven)
-                segment = rollout(call, *now, *part, *parameters)  # type: ignore[arg-type]
+                segment = rollout(call, *now, *part, *constant)  # type: ignore[arg-type]
                 if start + count < steps:
                     # A view would keep the segment alive to the backward.
                     now = tuple(None if t is None else t[-1].clone() for t in segment)
@@ -355,15 +375,58 @@ class Simulator(SceneIdentity, Measurements):
         self._finish(infos, result)
         return result, np.concatenate(signatures) if want_signature else None  # type: ignore[arg-type]
 
-    def _checked_inputs(self, where: str, state: Any, controls: Any, steps: int | None) -> tuple[Inputs, bool]:
-        shapes = (*self._parameter_shapes, *(self._packed.cloth_density.shape,) * len(CLOTH_PARAMETERS))
-        names = (*PARAMETERS, *CLOTH_PARAMETERS)
-        parameters = {name: (getattr(self, name), tuple(shape)) for name, shape in zip(names, shapes, strict=True)}
+    def contacts(
+        self, state: State, control: Control | None = None, *, parameters: Mapping[str, Tensor] | None = None
+    ) -> Contacts:
+        """The contacts of the step taken from a state, and their forces: differentiable, for losses on what is felt.
+
+        Args: As for one step.
+        Returns: What pushes at the end of the step, and with it, as `Contacts.end`, the state there. Over a batch the
+            contacts of all scenes, scene by scene. An impact's force is large: its impulse divided by `dt`.
+        Raises: As for one step.
+        Gradients: As for one step, to forces, positions, normals and distances; none to forces with ``compliance=0``,
+            whose backward raises NotImplementedError.
+        """
+        end = self.forward(state, control, parameters=parameters)
+        values = self._values("contacts", parameters)
+        inputs = self._checked_inputs("contacts", state, control, None, values)[0]
+        arrays = [None if t is None else t.detach().contiguous().numpy(force=True) for t in inputs]
+        taken = _core.rollout(
+            self._model,
+            self._options,
+            arrays,
+            steps=1,
+            controls_have_time=False,
+            keep_time=False,
+            record=True,
+            num_threads=1,
+            first_step=0,
+        )
+        assert taken.tape is not None  # it was recorded
+        read = _core.contacts(taken.tape, arrays)
+        hard = self._settings["compliance"] == 0.0
+        names = (*self._object_names, "ground")
+        return contacts_from(read, end, values["mass"], values["cloth_density"], self._cloth_of_node, names, hard)
+
+    def _values(self, where: str, parameters: Mapping[str, Tensor] | None) -> Mapping[str, Any]:
+        """The parameters of the module, and what takes their place in this call."""
+        own: Mapping[str, Any] = self._parameters
+        if len(own) < len(self._parameter_shapes):  # torch.nn.utils.parametrize has taken some out
+            own = {name: getattr(self, name) for name in self._parameter_shapes}
+        if parameters is None:
+            return own
+        return {**own, **checked_parameters(where, parameters, self._parameter_shapes)}
+
+    def _checked_inputs(
+        self, where: str, state: Any, controls: Any, steps: int | None, values: Mapping[str, Any] | None = None
+    ) -> CheckedInputs:
+        values = self._values(where, None) if values is None else values
+        parameters = {name: (values[name], self._parameter_shapes[name]) for name in (*PARAMETERS, *CLOTH_PARAMETERS)}
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
-    def _check_unused_parameters(self) -> None:
-        check_unused("friction", self.friction, self._object_shape, self._object_names)
-        check_unused("restitution", self.restitution, self._object_shape, self._object_names)
+    def _check_unused_parameters(self, values: Mapping[str, Any]) -> None:
+        for name in ("friction", "restitution"):
+            check_unused(name, values[name], self._parameter_shapes[name], self._object_names)
 
     def _finish(self, segments: list[Any], result: State) -> None:
         """Keeps the statistics of the call, and warns or raises if a step did not converge."""

@@ -46,6 +46,7 @@ public:
     SideOfCloth(const Zone& zone, int cloth, const Feature& feature)
         : m_zone(zone), m_cloth(cloth), m_feature(feature) {}
 
+    int cloth() const { return m_cloth; }  ///< index into Zone::cloths
     const Feature& feature() const { return m_feature; }
     /// The nodes of the zone that its feature has; -1 fills the rest.
     std::array<int, 3> nodes() const {

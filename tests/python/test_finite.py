@@ -144,6 +144,15 @@ def test_gradients_must_fit_into_the_states_precision() -> None:
                 loss.backward()
 
 
+def test_gradients_must_fit_into_the_precision_of_a_control() -> None:
+    sim = two_bodies()
+    force = torch.zeros(2, 3, requires_grad=True)
+    for controls in (ds.Control(force=force), [ds.Control(force=force.double()), ds.Control(force=force)]):
+        loss = sim.rollout(sim.initial_state(), controls, 2).position[-1, 0, 0] * 1e45
+        with pytest.raises(ds.GradientError, match=r"control.force"):
+            loss.backward()
+
+
 # ---- states ----------------------------------------------------------------------------------------------------------
 
 

@@ -64,6 +64,12 @@ def test_csrc_keeps_to_its_rooms() -> None:
     assert violations(CSRC) == []
 
 
+def test_the_page_for_contributors_names_every_room() -> None:
+    page = (CSRC.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
+    assert sorted(named) == sorted(ROOMS)
+
+
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """A small csrc in which every include is allowed."""

@@ -110,6 +110,72 @@ def test_mesh_transform_places_the_mesh_as_it_was_given() -> None:
     assert torch.equal(sim.vertices(trajectory)[2, 1], sim.vertices(trajectory[2, 1]))
 
 
+def test_place_is_the_inverse_of_mesh_transform() -> None:
+    sim, _ = offset_tetrahedron()
+    state = sim.initial_state()
+    q = torch.tensor([0.3, -0.5, 0.1, 0.7], dtype=torch.float64)
+    moved = sim.place(state, 0, position=(1.0, 2.0, 3.0), orientation=q)
+    frame = sim.mesh_transform(moved)
+    torch.testing.assert_close(frame[0, :3, 3], torch.tensor([1.0, 2.0, 3.0]).double(), rtol=0, atol=1e-14)
+    torch.testing.assert_close(frame[0, :3, :3], ds.rotation.to_matrix(q), rtol=0, atol=1e-15)
+    assert torch.equal(moved.position[1:], state.position[1:])
+    assert torch.equal(moved.velocity, state.velocity)
+    # Each alone leaves the other as it is: the mesh turns about its own origin.
+    turned, shifted = sim.place(state, 0, orientation=q), sim.place(state, 0, position=(1.0, 2.0, 3.0))
+    torch.testing.assert_close(sim.mesh_transform(turned)[0, :3, 3], torch.tensor([0.0, 2.0, 5.0]).double())
+    assert torch.equal(shifted.orientation, state.orientation)
+    # As a scene has it that was made so, in float32, with one place per scene and one in time.
+    positions = torch.randn(6, 3)
+    placed = sim.place(state.to(torch.float32), 0, position=positions)
+    assert placed.dtype == torch.float32
+    assert placed.leading_shape == placed.node_velocity.shape[:-2] == (6,)
+    torch.testing.assert_close(sim.mesh_transform(placed)[:, 0, :3, 3], positions)
+    trajectory = sim.rollout(sim.initial_state(batch=2), steps=3)
+    assert sim.place(trajectory, 0, position=torch.randn(3, 1, 3)).leading_shape == (3, 2)
+    mapped = torch.func.vmap(lambda p: sim.place(state, 0, position=p))(positions.double())
+    assert torch.equal(mapped.position, sim.place(state, 0, position=positions.double()).position)
+
+
+def test_place_is_differentiable() -> None:
+    sim, _ = offset_tetrahedron()
+    state = sim.initial_state()
+    p, q = torch.randn(2, 3, dtype=torch.float64), torch.randn(2, 4, dtype=torch.float64)
+    before = state.orientation.clone()
+
+    def places(p: Tensor, q: Tensor, before: Tensor) -> tuple[Tensor, ...]:
+        start = state.replace(orientation=before)
+        both, turned = sim.place(start, 0, position=p, orientation=q), sim.place(start, 0, orientation=q)
+        return both.position, both.orientation, turned.position, sim.place(start, 0, position=p).position
+
+    assert torch.func.jacrev(lambda q: places(p, q, before)[0])(q).any()
+    assert torch.autograd.gradcheck(places, [t.requires_grad_() for t in (p, q, before)])
+
+
+def test_wrong_places_are_named() -> None:
+    scene = ds.Scene()
+    ball = scene.add_sphere(0.1, density=1.0, name="ball")
+    sheet = scene.add_cloth(ds.shapes.sheet((1.0, 1.0), (2, 2)), position=(0, 0, 5), name="sheet")
+    sim = ds.Simulator(scene, dt=0.01)
+    state = sim.initial_state(batch=2)
+    cases: list[tuple[Any, dict[str, Any], type[Exception], str]] = [
+        (sheet, {}, ValueError, "place: handle must be of a body, got ClothHandle(1, 'sheet'"),
+        (5, {}, IndexError, ""),
+        (ball, {"position": (0, 0)}, ValueError, "place: position must have shape (..., 3), got (2,)"),
+        (ball, {"position": "up"}, TypeError, "place: position must be a torch.Tensor or 3 numbers, got 'up'"),
+        (ball, {"position": torch.zeros(3, 3).double()}, ValueError, "place: leading axes must broadcast with"),
+        (
+            ball,
+            {"orientation": (0, 0, 0, 0)},
+            ValueError,
+            "place: orientation must be quaternions w, x, y, z other than",
+        ),
+    ]
+    for handle, options, error, text in cases:
+        with pytest.raises(error) as caught:
+            sim.place(state, handle, **options)
+        assert text in str(caught.value)
+
+
 def test_vertices_are_differentiable() -> None:
     sim, _ = offset_tetrahedron()
     state = sim.initial_state()

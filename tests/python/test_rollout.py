@@ -43,6 +43,15 @@ def test_rollout_with_contact_is_repeated_stepping() -> None:
     assert_same(sim.rollout(state, None, 30), stepped(sim, state, [None] * 30))
 
 
+def test_controls_may_be_left_out_and_a_sequence_tells_the_number_of_steps(sim: ds.Simulator, state: ds.State) -> None:
+    expected = sim.rollout(state, None, 4)
+    assert_same(sim.rollout(state, steps=4), expected)
+    assert_same(sim.rollout(state, [ds.Control()] * 4), expected)
+    for controls in (None, ds.Control(), 4):
+        with pytest.raises(TypeError, match=r"rollout: steps must be given, as in sim.rollout\(state, steps=100\)"):
+            sim.rollout(state, controls)  # type: ignore[arg-type]
+
+
 def test_forms_of_controls_unbatched(sim: ds.Simulator, state: ds.State) -> None:
     forces = torch.randn(5, 2, 3, dtype=torch.float64)
     torque = torch.randn(2, 3, dtype=torch.float64)
@@ -123,7 +132,7 @@ def test_wrong_rollouts_are_named(sim: ds.Simulator, state: ds.State) -> None:
             ValueError,
             "controls.force must have shape (2, 3), (5, 2, 3) or (5, B, 2, 3), got (4, 2, 3)",
         ),
-        (ds.Control(force=zeros.float()), 4, {}, TypeError, "controls.force must have the dtype of the state"),
+        (ds.Control(force=zeros.half()), 4, {}, TypeError, "controls.force must have dtype torch.float32 or torch.fl"),
     ]
     for controls, steps, options, error, text in cases:
         with pytest.raises(error) as caught:

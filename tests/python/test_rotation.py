@@ -1,5 +1,7 @@
 """Rotations, and Appendix A to C of Qiao et al. 2020 with their errata."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -243,3 +245,32 @@ def test_mass_matrix_takes_batches() -> None:
     found = rotation.rpy_mass_matrix(rpy, mass, inertia)
     assert found.shape == (4, 6, 6)
     np.testing.assert_allclose(found[2], rotation.rpy_mass_matrix(rpy[2], mass[2], inertia), atol=ROUNDING)
+
+
+# ---- other orders ----------------------------------------------------------------------------------------------------
+
+
+def test_orders_of_components_are_exchanged() -> None:
+    q = np.array([[0.1, 0.2, 0.3, 0.4], [1.0, 2.0, 3.0, 4.0]])
+    assert np.array_equal(rotation.to_xyzw(q)[1], [2.0, 3.0, 4.0, 1.0])
+    assert np.array_equal(rotation.from_xyzw(rotation.to_xyzw(q)), q)
+    assert torch.equal(torch.func.vmap(rotation.from_xyzw)(torch.from_numpy(q))[0], torch.tensor(q[0]).roll(1))
+    assert torch.autograd.gradcheck(rotation.from_xyzw, torch.from_numpy(q).requires_grad_())
+
+
+def test_scipys_rotations_turn_vectors_as_ours_do() -> None:
+    q = torch.randn(5, 4, dtype=torch.float64, requires_grad=True)
+    p = np.array([0.3, -0.2, 0.9])
+    for value in (q, q.detach().numpy()):
+        turned = rotation.to_scipy(value)
+        np.testing.assert_allclose(turned.apply(p), rotation.rotate(q.detach().numpy(), p), atol=1e-14)
+    back = rotation.from_scipy(turned)
+    assert (back[:, 0] >= 0.0).all()
+    np.testing.assert_allclose(rotation.to_matrix(back), rotation.to_matrix(q.detach().numpy()), atol=1e-14)
+    assert rotation.from_scipy(turned[0]).shape == (4,)
+
+
+def test_without_scipy_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "scipy.spatial.transform", None)
+    with pytest.raises(ImportError, match=r"pip install 'mesh-diffsim\[scipy\]'"):
+        rotation.to_scipy(np.array([1.0, 0.0, 0.0, 0.0]))

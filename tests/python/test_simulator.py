@@ -145,6 +145,27 @@ def test_float32_gradients(sim: ds.Simulator, state: ds.State) -> None:
     assert sim.mass.grad.any()
 
 
+def test_float32_controls_beside_a_float64_state_are_cast(sim: ds.Simulator, state: ds.State) -> None:
+    force = torch.randn(2, 3, requires_grad=True)
+    cast = force.detach().double().requires_grad_()
+    for run in (
+        lambda f: sim(state, ds.Control(force=f, torque=f.detach().double())),
+        lambda f: sim.rollout(state, ds.Control(force=f), 3)[-1],
+        lambda f: sim.rollout(state, [ds.Control(force=f), ds.Control(), ds.Control(force=f.double())])[-1],
+        lambda f: sim.rollout(state, ds.Control(force=f.expand(3, 4, 2, 3)), 3)[-1, 0],
+    ):
+        end, expected = run(force), run(cast)
+        assert end.dtype == torch.float64
+        assert_same(end, expected)
+        (found,) = torch.autograd.grad(end.velocity.square().sum(), force)
+        (gradient,) = torch.autograd.grad(expected.velocity.square().sum(), cast)
+        assert found.dtype == torch.float32
+        assert found.any()
+        torch.testing.assert_close(found, gradient.float(), rtol=1e-5, atol=1e-6)  # sums over steps are float32
+    single = sim(state.to(torch.float32), ds.Control(force=cast.detach()))
+    assert single.dtype == torch.float32
+
+
 def test_wrong_tensors_are_named(sim: ds.Simulator, state: ds.State) -> None:
     zeros = torch.zeros(2, 3, dtype=torch.float64)
     cases: list[tuple[Any, Any, type[Exception], str]] = [
@@ -178,7 +199,12 @@ def test_wrong_tensors_are_named(sim: ds.Simulator, state: ds.State) -> None:
             "must be on the cpu, the only device diffsim runs on, got meta",
         ),
         (state, ds.Control(force=zeros.to("meta")), ValueError, "control.force must be on the cpu"),
-        (state, ds.Control(force=zeros.float()), TypeError, "control.force must have the dtype of the state"),
+        (
+            state,
+            ds.Control(force=zeros.half()),
+            TypeError,
+            "control.force must have dtype torch.float32 or torch.float",
+        ),
         (
             state,
             ds.Control(torque=zeros[0]),

@@ -147,3 +147,102 @@ def test_repr_is_short() -> None:
         " node_position=(7, 0, 3), node_velocity=(7, 0, 3), torch.float64)"
     )
     assert repr(ds.Control(force=torch.zeros(2, 3))) == "Control(force=(2, 3), torch.float32)"
+
+
+# ---- many as one -----------------------------------------------------------------------------------------------------
+
+
+def test_stack_and_cat_join_along_leading_axes() -> None:
+    a, b = random_state(4), random_state(4)
+    batch = ds.State.stack([a, b])
+    assert batch.leading_shape == (2, 4)
+    assert_same(batch[1], b)
+    assert_same(ds.State.stack([a, b], dim=1)[:, 0], a)
+    longer = ds.State.cat([a, b[:2]])
+    assert len(longer) == 6
+    assert_same(longer[4:], b[:2])
+    assert_same(ds.State.cat([batch, batch[:, :1]], dim=1)[:, 4], batch[:, 0])
+    # A field that all scenes of a batch share gets its own copy of the axis first.
+    shared = a.replace(velocity=a.velocity[0])
+    assert ds.State.stack([shared, b]).velocity.shape == (2, 4, 2, 3)
+    controls = ds.Control.stack([ds.Control(force=torch.ones(2, 3)), ds.Control(force=torch.zeros(2, 3))])
+    assert controls.force.shape == (2, 2, 3)
+    assert controls.torque is None
+    a.velocity.requires_grad_()
+    ds.State.cat([a, b]).velocity[:4].sum().backward()
+    assert torch.equal(a.velocity.grad, torch.ones(4, 2, 3).double())
+
+
+def test_where_takes_scenes_of_either_and_gradients_go_there() -> None:
+    start, state = random_state(), random_state(3)
+    start.position.requires_grad_()
+    state.position.requires_grad_()
+    mask = torch.tensor([True, False, True])
+    mixed = ds.State.where(mask, start, state)
+    assert_same(mixed[0], start)
+    assert_same(mixed[1], state[1])
+    assert mixed.node_position.shape == (3, 0, 3)
+    mixed.position.sum().backward()
+    assert torch.equal(start.position.grad, torch.full((2, 3), 2.0).double())
+    assert torch.equal(state.position.grad[:, 0, 0], torch.tensor([0.0, 1.0, 0.0]).double())
+    mapped = torch.func.vmap(ds.State.where, in_dims=(0, None, 0))(mask, start, state)
+    assert_same(mapped, mixed)
+
+
+def test_length_is_that_of_the_first_axis_and_truth_does_not_ask_for_it() -> None:
+    assert len(random_state(5, 4)) == 5
+    assert bool(random_state())
+    assert (ds.Control() or None) is not None
+    with pytest.raises(TypeError, match="State without a time or batch axis has no length"):
+        len(random_state())
+
+
+def test_what_does_not_fit_together_is_named() -> None:
+    a, b = random_state(4), random_state(3)
+    mask = torch.tensor([True] * 4)
+    force = ds.Control(force=torch.ones(2, 3))
+    cases = [
+        (lambda: ds.State.stack([]), ValueError, "State.stack: there must be at least one entry"),
+        (lambda: ds.State.stack([a, 1]), TypeError, "entries[1] must be a diffsim.State, got int"),
+        (lambda: ds.State.stack([a, b]), ValueError, "entries[1].position has shape (3, 2, 3), which does not fit (4,"),
+        (lambda: ds.State.stack([a, a], dim=2), IndexError, "of which there are 2, got 2"),
+        (lambda: ds.State.cat([a[0], b[0]]), IndexError, "State.cat: dim must be that of a leading axis"),
+        (lambda: ds.State.cat([a, a.to(torch.float32)]), TypeError, "entries[1].position has dtype torch.float32"),
+        (lambda: ds.State.cat([a, random_state(4, bodies=3)]), ValueError, "are they of different scenes?"),
+        (lambda: ds.Control.stack([force, ds.Control()]), ValueError, "entries[0] has force, entries[1] has None"),
+        (lambda: ds.State.where(mask.double(), a, a), TypeError, "mask must be a tensor of torch.bool, got torch.fl"),
+        (
+            lambda: ds.State.where(mask, a, b),
+            ValueError,
+            "mask, a.position and b.position are (4,), (4,), (3,)",
+        ),
+        (lambda: ds.State.where(mask, a, None), TypeError, "State.where: b must be a diffsim.State, got NoneType"),
+    ]
+    for call, error, text in cases:
+        with pytest.raises(error) as caught:
+            call()
+        assert text in str(caught.value)
+
+
+class Pushes(torch.utils.data.Dataset):  # at the top of the module, so that workers can be given it
+    def __init__(self, states: ds.State) -> None:
+        self.states = states
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __getitem__(self, i: int) -> dict[str, object]:
+        return {"start": self.states[i], "control": ds.Control(force=torch.full((2, 3), float(i))), "label": i}
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_torch_collates_states_and_dicts_that_hold_them(workers: int) -> None:
+    states = random_state(5)
+    first = next(iter(torch.utils.data.DataLoader(list(states), batch_size=3)))
+    assert_same(first, states[:3])
+    loaded = list(torch.utils.data.DataLoader(Pushes(states), batch_size=2, num_workers=workers))
+    assert len(loaded) == 3
+    assert_same(loaded[1]["start"], states[2:4])
+    assert torch.equal(loaded[1]["control"].force[:, 0, 0], torch.tensor([2.0, 3.0]))
+    assert loaded[1]["control"].torque is None
+    assert torch.equal(loaded[2]["label"], torch.tensor([4]))
