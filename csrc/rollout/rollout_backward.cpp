@@ -4,6 +4,7 @@
 #include "math/rotation.hpp"
 #include "rollout/inputs.hpp"
 #include "rollout/scenes.hpp"
+#include "step/body_step.hpp"
 
 namespace diffsim {
 namespace {
@@ -43,10 +44,7 @@ SceneState end_state(const StepRecord& record) {
     SceneState end = record.start;
     if (record.held) return end;
     for (std::size_t i = 0; i < end.bodies.size(); ++i) {
-        const Vec3 turn = record.y.bodies[i].head<3>();
-        if (turn.isZero(0.0)) continue;
-        end.bodies[i].orientation = quaternion_multiply(exp_quaternion(turn), end.bodies[i].orientation);
-        end.bodies[i].orientation /= end.bodies[i].orientation.norm();
+        end.bodies[i].orientation = turned(end.bodies[i].orientation, record.y.bodies[i].head<3>());
     }
     return end;
 }

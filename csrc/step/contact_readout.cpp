@@ -1,59 +1,68 @@
 #include "step/contact_readout.hpp"
 
-#include "contact/contact_derivatives.hpp"
 #include "step/recorded_zones.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
 
-double feature_mass(const Zone& zone, const ZoneContact& contact, bool of_a) {
-    const int body = of_a ? contact.a : contact.b;
-    if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) return zone.yields(body) ? zone.bodies[body].mass : 0.0;
-    double mass = 0.0;
-    for (int node : feature_nodes(zone, contact, of_a))
-        if (node >= 0) mass += zone.nodes[node].mass;
-    return mass;
+/// d(log stiffness)/d(log mass) of an object.
+double mass_exponent(const Zone& zone, const SideOfBody& side, double log_gradient) {
+    return log_gradient * (side.yields() ? zone.bodies[side.body()].mass : 0.0);
+}
+double mass_exponent(const Zone&, const SideOfCloth& side, double log_gradient) { return log_gradient * side.mass(); }
+
+void read_nodes(
+    const Zone&, const ZonePoint&, const ClosestPoint&, const Vec3&, const SideOfBody&, ContactReadout::Side&) {}
+void read_nodes(
+    const Zone& zone, const ZonePoint& point, const ClosestPoint& closest, const Vec3& normal, const SideOfCloth& side,
+    ContactReadout::Side& result) {
+    const PlacedSide<ClothSide> placed = placed_side(side, closest, normal, point.poses, point.nodes);
+    result.weights = placed.side.weights;
+    result.slide_weights = placed.side.slide;
+    const int to_model = zone.cloth(side.cloth()).first_node - zone.cloths[side.cloth()].first_node;
+    for (std::size_t k = 0; k < 3; ++k) result.nodes[k] = placed.nodes[k] < 0 ? -1 : placed.nodes[k] + to_model;
 }
 
+template <class Side>
 ContactReadout::Side read_side(
-    const Zone& zone, const ZonePoint& point, const ZoneContact& contact, const ContactGeometry& geometry, bool of_a) {
-    ContactReadout::Side side;
-    side.object = of_a ? contact.contact.object_a : contact.contact.object_b;
-    const ClosestPoints& closest = geometry.closest;
-    side.point = (of_a ? closest.point_a : closest.point_b) + zone.origin;
-    if (side.object == kGround) {  // a plane: slides are what is level
-        side.slide_count = 2;
-        side.slides = {Vec3::UnitX(), Vec3::UnitY()};
-        return side;
-    }
-    side.slide_count = of_a ? closest.slide_count_a : closest.slide_count_b;
-    side.slides = slide_directions(geometry, of_a);
-    side.mass_exponent = (of_a ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b) *
-                         feature_mass(zone, contact, of_a);
-    const int cloth = of_a ? contact.cloth_a : contact.cloth_b;
-    if (cloth < 0) return side;
-    const Surface surface =
-        of_a ? surface_a(zone, contact, point.poses, point.nodes) : surface_b(zone, contact, point.poses, point.nodes);
-    const ClothSide weights = cloth_side(contact.contact, geometry, surface, of_a);
-    side.weights = weights.weights;
-    side.slide_weights = weights.slide;
-    const std::array<int, 3> nodes = feature_nodes(zone, contact, of_a);
-    const int to_model = zone.cloth(cloth).first_node - zone.cloths[cloth].first_node;
-    for (std::size_t k = 0; k < 3; ++k) side.nodes[k] = nodes[k] < 0 ? -1 : nodes[k] + to_model;
-    return side;
+    const Zone& zone, const ZonePoint& point, const ClosestPoint& closest, const Vec3& normal, const Side& side,
+    int object, double log_gradient) {
+    ContactReadout::Side result;
+    result.object = object;
+    result.point = closest.point + zone.origin;
+    result.slide_count = closest.slide_count;
+    result.slides = slide_directions(closest, normal);
+    result.mass_exponent = mass_exponent(zone, side, log_gradient);
+    read_nodes(zone, point, closest, normal, side, result);
+    return result;
+}
+
+/// A plane: slides are what is level.
+ContactReadout::Side read_side(
+    const Zone& zone, const ZonePoint&, const ClosestPoint& closest, const Vec3&, const SideOfGround&, int, double) {
+    ContactReadout::Side result;
+    result.point = closest.point + zone.origin;
+    result.slide_count = 2;
+    result.slides = {Vec3::UnitX(), Vec3::UnitY()};
+    return result;
 }
 
 ContactReadout read_contact(const Zone& zone, const ZonePoint& point, const ActiveContact& active, double dt) {
     const ZoneContact& contact = zone.contacts[active.index];
     const ContactGeometry& geometry = active.geometry;
-    const PotentialValue potential = contact_potential(
-        contact.range.rest - geometry.distance, contact.range.rest - contact.range.pole, contact.stiffness.value);
+    const PotentialValue potential = normal_force(contact.law, geometry.distance);
     const double share = edge_mollifier(geometry.sine_sq).value / (dt * dt);
     ContactReadout result;
-    result.sides = {read_side(zone, point, contact, geometry, true), read_side(zone, point, contact, geometry, false)};
-    result.normal = geometry.normal;
+    const ContactStiffness& stiffness = contact.law.stiffness;
+    const Vec3& n = geometry.normal;
+    with_sides(zone, contact, [&](const auto& a, const auto& b) {
+        result.sides = {
+            read_side(zone, point, geometry.closest.a, n, a, contact.contact.object_a, stiffness.log_gradient_a),
+            read_side(zone, point, geometry.closest.b, n, b, contact.contact.object_b, stiffness.log_gradient_b)};
+    });
+    result.normal = n;
     result.distance = geometry.distance;
-    result.sine_sq = geometry.sine_sq;
     result.sine_sq = geometry.sine_sq;
     result.force = share * potential.force;
     result.stiffness = share * potential.stiffness;
