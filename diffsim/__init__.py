@@ -1,6 +1,7 @@
 """Differentiable simulation of triangle meshes in contact, as a PyTorch layer."""
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from . import diagnostics, parameters, rotation, shapes
 from ._units import UnitsWarning
@@ -34,7 +35,13 @@ __all__ = [
 ]
 
 
+if TYPE_CHECKING:
+    from . import interop as interop
+
+
 def __getattr__(name: str) -> Any:
+    if name == "interop":
+        return import_module(".interop", __name__)
     if name == "__version__":
         from importlib.metadata import version
 
