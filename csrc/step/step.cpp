@@ -341,7 +341,6 @@ private:
     }
 
     SceneState finish() {
-        const double dt = m_options.dt;
         for (int root : m_scratch.movers) {
             const GroupOutcome& outcome = m_scratch.outcomes[root];
             if (!outcome.solved) continue;
