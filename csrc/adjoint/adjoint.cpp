@@ -96,8 +96,8 @@ Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, cons
 
 /// What contacts add to the gradients of masses through their stiffness, between bodies and with the ground.
 void add_body_stiffness(
-    const Zone& zone, const std::vector<BodyContacts>& contacts, const std::vector<Vec6>& twist, ZoneAdjoint& result) {
-    for (const BodyContacts& c : contacts) {
+    const Zone& zone, const std::vector<PairSums>& contacts, const std::vector<Vec6>& twist, ZoneAdjoint& result) {
+    for (const PairSums& c : contacts) {
         double along = 0.0;
         for (const auto& [body, part] : {std::pair<int, Vec6>(c.a, c.gradient.head<6>()), {c.b, c.gradient.tail<6>()}})
             if (zone.yields(body)) along += part.dot(twist[body]);
@@ -228,7 +228,7 @@ const ZoneAdjoint& zone_adjoint(
     add_bodies(zone, point, upstream, exact ? &derivatives.torque : nullptr, needs, twist, result);
     if (needs.mass && !zone.exact_contact) {
         if (!exact) differentiate(zone, point, Curvature::none, derivatives, nullptr);
-        add_body_stiffness(zone, derivatives.body_contacts, twist, result);
+        add_body_stiffness(zone, derivatives.pair_sums, twist, result);
     }
     if (needs.place || needs.mass)
         add_contacts(zone, point, exact ? nullptr : &multipliers.rows, needs, twist, multipliers.reactions, result);

@@ -28,7 +28,7 @@ void fill(
     const PlacedSide<GroundSide>&, ContactTerm& term) {
     term.side_count = 1;
     set(term.sides[0], a);
-    term.row = GroundContacts::row(geometry.closest.a.point - a.side.center);
+    term.row = GroundSums::row(geometry.closest.a.point - a.side.center);
     term.stiffness = normal_force(law, geometry.distance).stiffness;
 }
 

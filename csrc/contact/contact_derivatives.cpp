@@ -267,13 +267,13 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     return result;
 }
 
-Vec6 GroundContacts::row(const Vec3& arm) {
+Vec6 GroundSums::row(const Vec3& arm) {
     Vec6 row;
     row << arm.y(), -arm.x(), 0.0, 0.0, 0.0, 1.0;
     return row;
 }
 
-PotentialValue GroundContacts::add(double height, const Vec3& arm, const ContactLaw& law) {
+PotentialValue GroundSums::add(double height, const Vec3& arm, const ContactLaw& law) {
     const PotentialValue potential = normal_force(law, height);
     m_force += potential.force;
     m_force_arm += potential.force * arm;
@@ -287,13 +287,13 @@ PotentialValue GroundContacts::add(double height, const Vec3& arm, const Contact
     return potential;
 }
 
-Vec6 GroundContacts::gradient() const {
+Vec6 GroundSums::gradient() const {
     Vec6 gradient;
     gradient << -m_force_arm.y(), m_force_arm.x(), 0.0, 0.0, 0.0, -m_force;
     return gradient;
 }
 
-Mat6 GroundContacts::hessian(bool with_curvature) const {
+Mat6 GroundSums::hessian(bool with_curvature) const {
     Mat6 hessian = Mat6::Zero();
     const auto set = [&](int i, int j, double value) { hessian(i, j) = hessian(j, i) = value; };
     set(0, 0, m_moments[5]);

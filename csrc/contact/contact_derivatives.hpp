@@ -55,7 +55,7 @@ Vector<12> both_twists(const Vector<9>& relative);
 Square<12> both_twists(const Square<9>& relative);
 
 /// The same of a rigid body's vertices above the ground, where they are short: of all its contacts together.
-class GroundContacts {
+class GroundSums {
 public:
     /// Of the height, along the twist, for a vertex with this arm from the centre of mass.
     static Vec6 row(const Vec3& arm);

@@ -191,7 +191,7 @@ private:
         const Vector<12> gradient = both_twists(m_gradient);
         if (a_yields) m_derivatives.gradient.bodies[m_a] += gradient.head<6>();
         if (b_yields) m_derivatives.gradient.bodies[m_b] += gradient.tail<6>();
-        m_derivatives.body_contacts.push_back({m_a, m_b, *m_stiffness, gradient});
+        m_derivatives.pair_sums.push_back({m_a, m_b, *m_stiffness, gradient});
         if (m_system != nullptr) {
             Square<9> relative = m_hessian.whole();
             if (a_yields && b_yields) cut_negative_part<9>(m_cut, relative);
@@ -292,7 +292,7 @@ private:
         if (m_own_force) return m_ground.add_force(*m_own_force, arm);
         const PotentialValue d = m_ground.add(geometry.distance, arm, contact.law);
         const ZoneBody& body = m_zone.bodies[a.body];
-        const Vec3 turn = GroundContacts::row(arm).head<3>();
+        const Vec3 turn = GroundSums::row(arm).head<3>();
         note_scale(turn.dot(body.inverse_inertia * turn) + 1.0 / body.mass, d.force, d.stiffness);
     }
 
@@ -301,7 +301,7 @@ private:
         Vector<12> gradient = Vector<12>::Zero();
         gradient.head<6>() = m_ground.gradient();
         m_derivatives.gradient.bodies[m_on_ground] += gradient.head<6>();
-        m_derivatives.body_contacts.push_back({m_on_ground, kGround, *m_ground_stiffness, gradient});
+        m_derivatives.pair_sums.push_back({m_on_ground, kGround, *m_ground_stiffness, gradient});
         if (m_system != nullptr) {
             Mat6 hessian = m_ground.hessian(m_with_curvature);
             cut_negative_part<6>(m_cut, hessian);
@@ -335,7 +335,7 @@ private:
     HalfSymmetric<9> m_hessian;
     const ContactStiffness* m_stiffness = nullptr;
     int m_on_ground = kNobody;  // the body at hand there
-    GroundContacts m_ground;
+    GroundSums m_ground;
     const ContactStiffness* m_ground_stiffness = nullptr;
 };
 

@@ -28,7 +28,7 @@ namespace {
 
 void set_zero(const Zone& zone, ZoneDerivatives& derivatives) {
     derivatives.gradient.assign_zero(static_cast<std::size_t>(zone.dynamic_count), zone.nodes.size());
-    derivatives.body_contacts.clear();
+    derivatives.pair_sums.clear();
     derivatives.largest_force = derivatives.largest_stiffness = 0.0;
 }
 

@@ -15,7 +15,7 @@ enum class Curvature {
 };
 
 /// All contacts of two bodies, or of one and the ground.
-struct BodyContacts {
+struct PairSums {
     int a, b;
     ContactStiffness stiffness;
     Vector<12> gradient;  ///< along both twists
@@ -23,7 +23,7 @@ struct BodyContacts {
 
 struct ZoneDerivatives {
     Coordinates gradient;  ///< zero at pinned nodes
-    std::vector<BodyContacts> body_contacts;
+    std::vector<PairSums> pair_sums;
     std::vector<Vec3> torque;    ///< world-frame gradient with respect to turns, contacts only
     std::vector<Mat3> jacobian;  ///< of the bodies' turns: d(turn)/d(theta)
     double largest_force;      ///< of a contact on a body, of all but inertia on a node, in units of |L⁻¹ g|, M = L Lᵀ

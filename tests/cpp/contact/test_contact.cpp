@@ -330,7 +330,7 @@ TEST(ground_derivatives_agree_with_differences) {
                 model, {0, kGround, ContactType::vertex_patch, vertex, -1}, moved, {}, ground_height);
         };
         const auto contacts = [&](const VectorX& x) {
-            GroundContacts result;
+            GroundSums result;
             for (const int vertex : kVertices) {
                 const ContactGeometry g = at(x, vertex);
                 result.add(g.distance, g.closest.a.point - center(x), law);
@@ -352,7 +352,7 @@ TEST(ground_derivatives_agree_with_differences) {
         Mat6 rows = Mat6::Zero();
         for (const int vertex : kVertices) {
             const ContactGeometry geometry = at(zero, vertex);
-            const Vec6 row = GroundContacts::row(geometry.closest.a.point - pose.t);
+            const Vec6 row = GroundSums::row(geometry.closest.a.point - pose.t);
             rows += normal_force(law, geometry.distance).stiffness * row * row.transpose();
         }
         CHECK(g.head<3>().norm() > 1e-3);
