@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "zone/contact_memory.hpp"
+#include "zone/zone_derivatives.hpp"
 
 namespace diffsim {
 namespace {
