@@ -3,9 +3,9 @@
 from typing import Any
 
 from . import diagnostics, parameters, rotation, shapes
+from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from ._units import UnitsWarning
 from .materials import ClothMaterial
-from .ops import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from .scene import BodyHandle, ClothHandle, Scene
 from .simulator import Simulator
 from .state import Control, State

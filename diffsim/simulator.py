@@ -32,10 +32,10 @@ from ._inputs import (
     state_from,
 )
 from ._measurements import Measurements
-from ._outcome import combined, failure_text, warn_of_failure, warn_of_fast_impacts
+from ._outcome import Info, SolverError, combined, failure_text, warn_of_failure, warn_of_fast_impacts
 from ._packed import PackedScene, core_model
 from ._progress import progress_bar
-from .ops import Info, RolloutCall, SolverError, rollout
+from .ops import RolloutCall, rollout
 from .scene import Scene
 from .state import Control, State
 
