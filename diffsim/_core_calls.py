@@ -120,6 +120,11 @@ def run_backward(call: RolloutCall, needs: Sequence[bool], arrays: list[Any]) ->
         needs: Of each input.
         arrays: Of the inputs, then of the gradients of the outputs.
     """
+    if call.options.newton_iterations is not None:
+        raise NotImplementedError(
+            "diffsim: there are no gradients through newton_iterations: where Newton's method is cut short they"
+            " take third derivatives of the elastic energy; leave it at None, or step under torch.no_grad()"
+        )
     inputs, upstream = arrays[:INPUT_COUNT], arrays[INPUT_COUNT:]
     tape = call.tape or _run(call, inputs, record=True).tape
     assert tape is not None  # it was recorded

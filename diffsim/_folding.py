@@ -14,10 +14,12 @@ Dims = Sequence[int | None]
 
 
 class Axes(Protocol):
-    """What a call says about time axes."""
+    """What a call says about time axes: whether controls have one, and outputs."""
 
-    controls_have_time: bool
-    keep_time: bool  #: whether the outputs have one
+    @property
+    def controls_have_time(self) -> bool: ...
+    @property
+    def keep_time(self) -> bool: ...
 
 
 def map_forward(

@@ -17,7 +17,7 @@ __all__ = ["RolloutCall", "rollout"]
 # shortcuts are open that halve the cost of a call.
 _transforms_active = torch._C._are_functorch_transforms_active
 
-_FIRST_ORDER_ONLY = (
+FIRST_ORDER_ONLY = (
     "diffsim: gradients are first order only; a second derivative through a step was asked for (create_graph=True,"
     " hessian, or a gradient of a gradient)"
 )
@@ -38,11 +38,6 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        if ctx.call.options.newton_iterations is not None:
-            raise NotImplementedError(
-                "diffsim: there are no gradients through newton_iterations: where Newton's method is cut short they"
-                " take third derivatives of the elastic energy; leave it at None, or step under torch.no_grad()"
-            )
         call = _BackwardCall(ctx.call, ctx.needs_input_grad[1:])
         if torch.is_grad_enabled() or _transforms_active():
             return None, *_RolloutBackward.apply(call, *ctx.saved_tensors, *grads)
@@ -50,7 +45,7 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # of a gradient: other tangents show in the inputs, and are refused there
-        raise NotImplementedError(_FIRST_ORDER_ONLY)
+        raise NotImplementedError(FIRST_ORDER_ONLY)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], call: RolloutCall, *inputs: Tensor | None) -> Any:
@@ -89,11 +84,11 @@ class _RolloutBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> OptionalTensors:
-        raise NotImplementedError(_FIRST_ORDER_ONLY)
+        raise NotImplementedError(FIRST_ORDER_ONLY)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise NotImplementedError(_FIRST_ORDER_ONLY)
+        raise NotImplementedError(FIRST_ORDER_ONLY)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], backward_call: _BackwardCall, *tensors: Tensor | None) -> Any:
