@@ -49,9 +49,9 @@ def check_number(
 
 def check_count(where: str, name: str, value: object) -> int:
     """A whole number, at least 1."""
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
+    if isinstance(value, bool) or not (isinstance(value, int) or hasattr(value, "__index__")):
         raise TypeError(message(where, name, "be a whole number", type(value).__name__))
-    count = int(value.__index__())
+    count = value if isinstance(value, int) else int(value.__index__())
     if count < 1:
         raise ValueError(message(where, name, "be at least 1", count))
     return count

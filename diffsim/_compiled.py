@@ -17,17 +17,26 @@ from weakref import WeakValueDictionary
 import numpy as np
 import torch
 from torch import Tensor
+from torch._functorch.utils import enable_single_level_autograd_function
+from torch.autograd.function import _SingleLevelFunction
 
 from . import _core
-from ._core_calls import BASE_NDIM, INPUT_COUNT, OptionalTensors, RolloutCall, as_arrays, run_backward, run_forward
+from ._core_calls import (
+    BASE_NDIM,
+    CONTROLS,
+    INPUT_COUNT,
+    OptionalTensors,
+    RolloutCall,
+    as_arrays,
+    run_backward,
+    run_forward,
+)
 from ._folding import map_backward, map_forward
 from .ops import FIRST_ORDER_ONLY
 
 
 class Owner(Protocol):
     """What a simulator is asked for where an op runs."""
-
-    _node_count: int
 
     def _make_call(self, steps: int, **settings: Any) -> RolloutCall: ...
     def _check_unread(self, friction: Tensor, restitution: Tensor) -> None: ...
@@ -70,6 +79,13 @@ def enlist(owner: Owner) -> int:
     return number
 
 
+def _owner(number: int) -> Owner:
+    owner = _owners.get(number)
+    if owner is None:
+        raise RuntimeError("diffsim: the simulator this code was compiled with is no more; compile it again")
+    return owner
+
+
 def rollout(
     owner: int,
     inputs: Sequence[Tensor | None],
@@ -92,15 +108,17 @@ def rollout(
 
 # ---- the forward -----------------------------------------------------------------------------------------------------
 
-
-@torch.library.custom_op(
-    "diffsim::rollout",
-    mutates_args=(),
-    schema=f"({_SETTINGS}, {_INPUTS}, Tensor friction, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})",
+# By hand and not by torch.library.custom_op: what that makes of a derivative cannot be called inside torch.func.
+_library = torch.library.Library("diffsim", "DEF")
+_library.define(
+    f"rollout({_SETTINGS}, {_INPUTS}, Tensor friction, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})"
 )
+_library.define(f"rollout_backward({_SETTINGS}, bool[] needs, Tensor tape, {_INPUTS}, {_GRADS}) -> Tensor[]")
+
+
 def _forward(*args: Any) -> tuple[Tensor, ...]:
     settings, inputs = _Settings(*args[:_HEAD]), args[_HEAD : _HEAD + INPUT_COUNT]
-    owner = _owners[settings.owner]
+    owner = _owner(settings.owner)
     owner._check_unread(*args[_HEAD + INPUT_COUNT :])
     call = _call_of(settings)
     call.record = settings.record
@@ -111,7 +129,7 @@ def _forward(*args: Any) -> tuple[Tensor, ...]:
 
 
 def _call_of(settings: _Settings) -> RolloutCall:
-    return _owners[settings.owner]._make_call(
+    return _owner(settings.owner)._make_call(
         settings.steps,
         controls_have_time=settings.controls_have_time,
         keep_time=settings.keep_time,
@@ -133,12 +151,11 @@ def _no_nodes(position: Tensor) -> Tensor:
     return position.new_empty(*position.shape[:-2], 0, 3)
 
 
-@_forward.register_fake
-def _(*args: Any) -> tuple[Tensor, ...]:
+def _forward_shapes(*args: Any) -> tuple[Tensor, ...]:
     settings, inputs = _Settings(*args[:_HEAD]), args[_HEAD : _HEAD + INPUT_COUNT]
     leading = [settings.steps] if settings.keep_time else []
     for t, base, i in zip(inputs, BASE_NDIM, range(INPUT_COUNT)):
-        time = int(settings.controls_have_time and 6 <= i < 12)
+        time = int(settings.controls_have_time and i in CONTROLS)
         if t is not None and t.ndim > base + time:
             leading.append(t.shape[time])
             break
@@ -149,24 +166,31 @@ def _(*args: Any) -> tuple[Tensor, ...]:
     return (*outputs, inputs[0].new_empty(1, dtype=torch.int64))
 
 
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.settings = _Settings(*inputs[:_HEAD])
-    ctx.save_for_backward(output[-1], *inputs[_HEAD : _HEAD + INPUT_COUNT])
-    ctx.mark_non_differentiable(output[-1])
-    ctx.set_materialize_grads(False)
+def _next_level(op: Any, grad_enabled: bool, args: tuple[Any, ...]) -> Any:
+    """Past this level's autograd, to that of an outer level of torch.func, which a Function's forward switches off."""
+    with torch.set_grad_enabled(grad_enabled), torch._C._AutoDispatchBelowAutograd():
+        return op(*args)
 
 
-def _autograd(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
-    needs = list(ctx.needs_input_grad[_HEAD : _HEAD + INPUT_COUNT])
-    found = iter(torch.ops.diffsim.rollout_backward(*ctx.settings, needs, *ctx.saved_tensors, *grads[:_OUTPUT_COUNT]))
-    return (*(None,) * _HEAD, *(next(found) if needed else None for needed in needs), None, None)
+class _Differentiated(_SingleLevelFunction):
+    @staticmethod
+    def forward(ctx: Any, grad_enabled: bool, *args: Any) -> tuple[Tensor, ...]:
+        outputs: tuple[Tensor, ...] = _next_level(torch.ops.diffsim.rollout, grad_enabled, args)
+        ctx.settings = _Settings(*args[:_HEAD])
+        ctx.save_for_backward(outputs[-1], *args[_HEAD : _HEAD + INPUT_COUNT])
+        ctx.mark_non_differentiable(outputs[-1])
+        ctx.set_materialize_grads(False)
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
+        needs = list(ctx.needs_input_grad[1 + _HEAD : 1 + _HEAD + INPUT_COUNT])
+        upstream = grads[:_OUTPUT_COUNT]
+        found = iter(torch.ops.diffsim.rollout_backward(*ctx.settings, needs, *ctx.saved_tensors, *upstream))
+        return (*(None,) * (1 + _HEAD), *(next(found) if needed else None for needed in needs), None, None)
 
 
-_forward.register_autograd(_autograd, setup_context=_setup_context)
-
-
-@_forward.register_vmap
-def _(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
+def _forward_vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
     head, last = args[:_HEAD], slice(_HEAD, _HEAD + INPUT_COUNT)
     unread = [t if d is None else t.select(d, 0) for t, d in zip(args[last.stop :], in_dims[last.stop :])]
     record: list[Tensor] = []
@@ -183,11 +207,6 @@ def _(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
 # ---- the backward ----------------------------------------------------------------------------------------------------
 
 
-@torch.library.custom_op(
-    "diffsim::rollout_backward",
-    mutates_args=(),
-    schema=f"({_SETTINGS}, bool[] needs, Tensor tape, {_INPUTS}, {_GRADS}) -> Tensor[]",
-)
 def _backward(*args: Any) -> list[Tensor]:
     """Gradients of the inputs that need one."""
     needs, record, tensors = args[_HEAD], args[_HEAD + 1], args[_HEAD + 2 :]
@@ -199,20 +218,21 @@ def _backward(*args: Any) -> list[Tensor]:
     return [torch.zeros(t.shape, dtype=t.dtype) if g is None else g for t, g in wanted]
 
 
-@_backward.register_fake
-def _(*args: Any) -> list[Tensor]:
+def _backward_shapes(*args: Any) -> list[Tensor]:
     return [t.new_empty(t.shape) for t, needed in zip(args[_HEAD + 2 :], args[_HEAD]) if needed]
 
 
-def _second(ctx: Any, *grads: Any) -> Any:
-    raise NotImplementedError(FIRST_ORDER_ONLY)
+class _Once(_SingleLevelFunction):
+    @staticmethod
+    def forward(ctx: Any, grad_enabled: bool, *args: Any) -> tuple[Tensor, ...]:
+        return tuple(_next_level(torch.ops.diffsim.rollout_backward, grad_enabled, args))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        raise NotImplementedError(FIRST_ORDER_ONLY)
 
 
-_backward.register_autograd(_second)
-
-
-@_backward.register_vmap
-def _(info: Any, in_dims: tuple[Any, ...], *args: Any) -> Any:
+def _backward_vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> Any:
     head, needs, tensors = args[: _HEAD + 2], args[_HEAD], slice(_HEAD + 2, None)
 
     def apply(folded: list[Tensor | None]) -> list[Tensor | None]:
@@ -222,3 +242,22 @@ def _(info: Any, in_dims: tuple[Any, ...], *args: Any) -> Any:
     outputs, _ = map_backward(_Settings(*args[:_HEAD]), info.batch_size, in_dims[tensors], args[tensors], apply)
     kept = [t for t in outputs if t is not None]
     return kept, [0] * len(kept)
+
+
+def _autograd_kernel(function: Any, kind: type) -> Any:
+    def kernel(*args: Any) -> Any:
+        # Not Function.apply: it would start torch.func's levels again, of which the dispatcher is in the middle here.
+        with enable_single_level_autograd_function():
+            return kind(function.apply(torch.is_grad_enabled(), *args))
+
+    return kernel
+
+
+for _name, _kernel, _shapes, _function, _kind, _vmap in (
+    ("rollout", _forward, _forward_shapes, _Differentiated, tuple, _forward_vmap),
+    ("rollout_backward", _backward, _backward_shapes, _Once, list, _backward_vmap),
+):
+    _library.impl(_name, _kernel, "CPU")
+    _library.impl(_name, _autograd_kernel(_function, _kind), "Autograd")
+    torch.library.register_fake(f"diffsim::{_name}", _shapes, lib=_library)
+    torch.library.register_vmap(f"diffsim::{_name}", _vmap, lib=_library)
