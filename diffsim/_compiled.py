@@ -189,6 +189,12 @@ class _Differentiated(_SingleLevelFunction):
         found = iter(torch.ops.diffsim.rollout_backward(*ctx.settings, needs, *ctx.saved_tensors, *upstream))
         return (*(None,) * (1 + _HEAD), *(next(found) if needed else None for needed in needs), None, None)
 
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise NotImplementedError(
+            "diffsim: there is no forward-mode AD through a step; use reverse mode (backward, torch.func.vjp, jacrev)"
+        )
+
 
 def _forward_vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
     head, last = args[:_HEAD], slice(_HEAD, _HEAD + INPUT_COUNT)
@@ -229,6 +235,10 @@ class _Once(_SingleLevelFunction):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
+        raise NotImplementedError(FIRST_ORDER_ONLY)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
         raise NotImplementedError(FIRST_ORDER_ONLY)
 
 

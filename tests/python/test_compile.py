@@ -91,8 +91,6 @@ def test_batches_float32_and_parameters_per_scene() -> None:
     force = torch.ones(1, 3)  # float32 beside float64, and without the batch axis
     masses = torch.stack([sim.mass.detach(), 2.0 * sim.mass.detach()])
     same_as_eager(loss_of(sim, state), state.velocity, force, mass=masses)
-    single = state.to(torch.float32)
-    same_as_eager(loss_of(sim, single), single.velocity, force)
 
 
 def test_transforms_inside_and_functional_call_keep_working() -> None:
@@ -123,7 +121,7 @@ def test_transforms_inside_and_functional_call_keep_working() -> None:
         lambda v: jvp(end, (v,), (tangent,)),
         torch.no_grad()(lambda v: jvp(end, (v,), (tangent,))),
     ):
-        with pytest.raises(Exception, match=r"first order only|forward AD"):
+        with pytest.raises(Exception, match=r"first order only|no forward-mode AD"):
             compiled(refused)(state.velocity)
 
 
