@@ -1,8 +1,10 @@
 # make demo       throw the bunny (examples/throw_bunny.py)
 # make examples   all examples, each of which checks itself; pictures in out/
 # make test       C++ and Python tests, the latter against the installed package
+# make check      after a change: what it touches is compiled and tested, the rest and all that is slow is left out
 # make sanitize   C++ tests in a Debug build with address and undefined-behaviour sanitizers
 # make lint       formatting, lint, types
+# make docs       the documentation as a site, build/docs/index.html
 # make bench      every benchmark, one CSV line per run
 # make clean      remove .venv, build/ and caches
 #
@@ -19,14 +21,20 @@ INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --co
 CONFIGURE := $(BIN)/cmake -S . -G Ninja "-DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python" \
              -DDIFFSIM_BUILD_PYTHON=OFF -DDIFFSIM_BUILD_TESTS=ON -DDIFFSIM_WERROR=ON
 CTEST := $(BIN)/ctest --output-on-failure --parallel 2 --test-dir
+# One thread of torch and BLAS for each worker: they share the processors.
+PYTEST := OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/pytest --numprocesses auto --dist worksteal
 
 # As pyproject.toml lists them under build-system, and what the C++ tests need besides.
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
+# As pyproject.toml lists them under dev, and what mypy reads the types of.
+LINT_TOOLS := clang-format mypy ruff torch numpy trimesh
+# As pyproject.toml lists them under docs.
+DOCS_TOOLS := furo myst-parser sphinx
 SOURCES := pyproject.toml CMakeLists.txt \
            $(shell find csrc diffsim -type f ! -path '*/__pycache__/*' ! -name '_core*.so')
 CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')
 
-.PHONY: demo examples test test-cpp test-python sanitize lint format bench clean
+.PHONY: demo examples test test-cpp test-python check sanitize lint format docs bench clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.with-examples
@@ -37,30 +45,38 @@ examples: $(VENV)/.with-examples
 
 test: test-cpp test-python
 
-test-cpp: $(VENV)/.build-tools
-	$(CONFIGURE) -B build/test -DCMAKE_BUILD_TYPE=RelWithDebInfo
-	$(BIN)/cmake --build build/test
+test-cpp: $(VENV)/.with-test
 	$(CTEST) build/test
 
 # From within .venv, where Python finds the installed diffsim and not the one in the source tree.
 test-python: $(VENV)/.with-test
-	cd $(VENV) && bin/pytest ../tests/python
+	cd $(VENV) && $(PYTEST) --durations=20 ../tests/python
+
+# In the tree of the tests, whose package is not installed again: Python takes the one in the source tree.
+check: $(VENV)/.once-tested
+	$(BIN)/cmake --build build/test
+	cp build/test/_core*.so diffsim/
+	$(CTEST) build/test --tests-regex "$$($(BIN)/python tests/touched.py cpp)"
+	PYTHONPATH=$(CURDIR) $(PYTEST) -m "not slow" $$($(BIN)/python tests/touched.py python)
 
 sanitize: $(VENV)/.build-tools
 	$(CONFIGURE) -B build/sanitize -DCMAKE_BUILD_TYPE=Debug -DDIFFSIM_SANITIZE=ON
 	$(BIN)/cmake --build build/sanitize
 	$(CTEST) build/sanitize
 
-lint: $(VENV)/.with-dev
+lint: $(VENV)/.lint-tools
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $(CXX_FILES)
 	$(BIN)/mypy
 
-format: $(VENV)/.with-dev
+format: $(VENV)/.lint-tools
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 	$(BIN)/clang-format -i $(CXX_FILES)
+
+docs: $(VENV)/.with-test $(VENV)/.docs-tools
+	$(BIN)/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going docs build/docs
 
 bench: $(VENV)/.with-bench
 	@for script in $(sort $(wildcard benchmarks/[a-z]*.py)); do $(BIN)/python $$script || exit 1; done
@@ -76,7 +92,31 @@ $(VENV)/.build-tools: constraints.txt | $(BIN)/python
 	$(INSTALL) $(BUILD_TOOLS)
 	@touch $@
 
-# The package and one of its extras. Without build isolation: only what changed is compiled again, with pinned tools.
+# What the tests need, whatever changed since.
+$(VENV)/.once-tested:
+	$(MAKE) $(VENV)/.with-test
+	@touch $@
+
+$(VENV)/.lint-tools: constraints.txt | $(BIN)/python
+	$(INSTALL) $(LINT_TOOLS)
+	@touch $@
+
+$(VENV)/.docs-tools: constraints.txt | $(BIN)/python
+	$(INSTALL) $(DOCS_TOOLS)
+	@touch $@
+
+# The package and one of its extras. Without build isolation: only what changed is compiled again, with pinned tools. Builds
+# with and without link-time optimization take each other's place, and with it their stamps.
 $(VENV)/.with-%: $(SOURCES) $(VENV)/.build-tools
 	$(INSTALL) --no-build-isolation --config-settings=build-dir=build/wheel ".[$*]"
+	@rm -f $(VENV)/.with-test
+	@touch $@
+
+# In one tree with the C++ tests, and without link-time optimization, which takes long and changes no bit.
+$(VENV)/.with-test: $(SOURCES) $(shell find tests/cpp -type f) $(VENV)/.build-tools
+	$(INSTALL) --no-build-isolation --config-settings=build-dir=build/test \
+	    --config-settings=cmake.define.DIFFSIM_LTO=OFF --config-settings=cmake.define.DIFFSIM_BUILD_TESTS=ON \
+	    --config-settings=cmake.define.DIFFSIM_WERROR=ON \
+	    $(if $(shell command -v ccache),--config-settings=cmake.define.CMAKE_CXX_COMPILER_LAUNCHER=ccache) ".[test]"
+	@rm -f $(VENV)/.with-*
 	@touch $@

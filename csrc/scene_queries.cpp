@@ -2,12 +2,13 @@
 
 #include <Eigen/LU>
 #include <algorithm>
-#include <cstdio>
 #include <stdexcept>
 #include <string>
 
 #include "math/rotation.hpp"
+#include "model/number_text.hpp"
 #include "solve/separation.hpp"
+#include "step/cloth_step.hpp"
 #include "zone/zone_contacts.hpp"
 
 namespace diffsim {
@@ -15,12 +16,6 @@ namespace {
 
 constexpr double kGoodEnough =
     0.01;  // of the contact's depth that may be missing after separation: a step can do with it
-
-std::string number(double value) {
-    char text[32];
-    std::snprintf(text, sizeof text, "%g", value);
-    return text;
-}
 
 [[noreturn]] void refuse_separation(
     const Model& model, const std::string& what, int a, int b, const std::string& mend) {
@@ -37,10 +32,10 @@ void check_separation(const Model& model, const Separation& separation, const Sc
     const int a = separation.worst.object_a, b = separation.worst.object_b;
     refuse_separation(
         model, "there is no room between", a, b,
-        " for the thickness: their meshes are " + number(separation.distance) + " m apart where they need " +
-            number(separation.rest) + " m, and moving them brings them too near to something else; they lack " +
-            number(separation.rest - separation.distance) + " m. Give a smaller thickness (it is " +
-            number(model.pair_thickness(a, b)) + " m), or make room");
+        " for the thickness: their meshes are " + number_text(separation.distance) + " m apart where they need " +
+            number_text(separation.rest) + " m, and moving them brings them too near to something else; they lack " +
+            number_text(separation.rest - separation.distance) + " m. Give a smaller thickness (it is " +
+            number_text(model.pair_thickness(a, b)) + " m), or make room");
 }
 
 }  // namespace
@@ -48,9 +43,7 @@ void check_separation(const Model& model, const Separation& separation, const Sc
 SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state) {
     Zone zone;
-    zone.model = &model;
-    set_compliance(zone, options.compliance);
-    zone.ground_height = model.ground.height;
+    make_zone(zone, model, parameters.cloths, options.compliance, 0.0, Vec3::Zero());
     PassiveBodies passive;
     std::vector<Box> boxes;
     for (int i = 0; i < model.body_count(); ++i) {
@@ -74,7 +67,6 @@ SceneState separate_state(
         SceneControl control;
         control.node_force.assign(state.node_position.size(), Vec3::Zero());
         control.node_velocity = control.node_force;
-        zone.cloth_parameters = &parameters.cloths;
         for (int c = 0; c < model.cloth_count(); ++c) add_cloth(zone, c, state, control, parameters);
     }
     if (zone.bodies.empty() && zone.nodes.empty()) return state;

@@ -1,10 +1,12 @@
 """Differentiable simulation of triangle meshes in contact, as a PyTorch layer."""
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from . import diagnostics, parameters, rotation, shapes
 from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from ._units import UnitsWarning
+from .contacts import Contacts
 from .materials import ClothMaterial
 from .scene import BodyHandle, ClothHandle, Scene
 from .simulator import Simulator
@@ -14,6 +16,7 @@ __all__ = [
     "BodyHandle",
     "ClothHandle",
     "ClothMaterial",
+    "Contacts",
     "Control",
     "ConvergenceWarning",
     "Failure",
@@ -32,7 +35,13 @@ __all__ = [
 ]
 
 
+if TYPE_CHECKING:
+    from . import interop as interop
+
+
 def __getattr__(name: str) -> Any:
+    if name == "interop":
+        return import_module(".interop", __name__)
     if name == "__version__":
         from importlib.metadata import version
 

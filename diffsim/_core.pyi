@@ -5,6 +5,7 @@ C-contiguous: another layout or dtype is a TypeError, not a copy.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +150,7 @@ def contact_systems(
 ) -> tuple[
     tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], ...
 ]: ...
+def contacts(tape: Tape, inputs: list[NDArray[np.float64] | None]) -> dict[str, NDArray[Any]]: ...
 def separate(
     model: Model,
     options: Options,

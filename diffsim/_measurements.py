@@ -178,8 +178,12 @@ class Measurements(nn.Module):
             mesh = trimesh.creation.icosphere(subdivisions=3, radius=float(p.margin[body]))
             mesh.apply_translation(vertices[0])
         else:
-            mesh = trimesh.creation.capsule(height=float(np.ptp(vertices[:, 2])), radius=float(p.margin[body]))
-            mesh.apply_translation(vertices.mean(axis=0) - mesh.bounds.mean(axis=0))
+            axis = vertices[1] - vertices[0]
+            align: Any = trimesh.geometry.align_vectors
+            mesh = trimesh.creation.capsule(height=float(np.linalg.norm(axis)), radius=float(p.margin[body]))
+            mesh.apply_translation(-mesh.bounds.mean(axis=0))
+            mesh.apply_transform(align([0.0, 0.0, 1.0], axis))
+            mesh.apply_translation(vertices.mean(axis=0))
         transform = _energies.pose_matrix(state.detach())[body]
         mesh.apply_transform(transform.numpy(force=True))
         return mesh

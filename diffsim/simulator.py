@@ -35,6 +35,7 @@ from ._measurements import Measurements
 from ._outcome import Info, SolverError, combined, failure_text, warn_of_failure, warn_of_fast_impacts
 from ._packed import PackedScene, core_model
 from ._progress import progress_bar
+from .contacts import Contacts, contacts_from
 from .ops import RolloutCall, rollout
 from .scene import Scene
 from .state import Control, State
@@ -180,6 +181,7 @@ class Simulator(SceneIdentity, Measurements):
         names = (*PARAMETERS, "friction", "restitution", *CLOTH_PARAMETERS)
         self._parameter_shapes = {name: torch.Size(getattr(p, name).shape) for name in names}
         self._object_names = (*p.names, *p.cloth_names)
+        self._cloth_of_node = torch.from_numpy(np.repeat(np.arange(len(p.node_count)), p.node_count))
         self._separated: tuple[np.ndarray, ...] | None = None
         self._number = _compiled.enlist(self)
 
@@ -376,6 +378,39 @@ class Simulator(SceneIdentity, Measurements):
         if not traced:
             self._finish(infos, result)
         return result, np.concatenate(signatures) if want_signature else None  # type: ignore[arg-type]
+
+    def contacts(
+        self, state: State, control: Control | None = None, *, parameters: Mapping[str, Tensor] | None = None
+    ) -> Contacts:
+        """The contacts of the step taken from a state, and their forces: differentiable, for losses on what is felt.
+
+        Args: As for one step.
+        Returns: What pushes at the end of the step, and with it, as `Contacts.end`, the state there. Over a batch the
+            contacts of all scenes, scene by scene. An impact's force is large: its impulse divided by `dt`.
+        Raises: As for one step.
+        Gradients: As for one step, to forces, positions, normals and distances; none to forces with ``compliance=0``,
+            whose backward raises NotImplementedError.
+        """
+        end = self.forward(state, control, parameters=parameters)
+        values = self._values("contacts", parameters)
+        inputs = self._checked_inputs("contacts", state, control, None, values)[0]
+        arrays = [None if t is None else t.detach().contiguous().numpy(force=True) for t in inputs]
+        taken = _core.rollout(
+            self._model,
+            self._options,
+            arrays,
+            steps=1,
+            controls_have_time=False,
+            keep_time=False,
+            record=True,
+            num_threads=1,
+            first_step=0,
+        )
+        assert taken.tape is not None  # it was recorded
+        read = _core.contacts(taken.tape, arrays)
+        hard = self._settings["compliance"] == 0.0
+        names = (*self._object_names, "ground")
+        return contacts_from(read, end, values["mass"], values["cloth_density"], self._cloth_of_node, names, hard)
 
     def _values(self, where: str, parameters: Mapping[str, Tensor] | None) -> Mapping[str, Any]:
         """The parameters of the module, and what takes their place in this call."""

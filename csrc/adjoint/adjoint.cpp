@@ -7,15 +7,18 @@
 #include "adjoint/contact_term.hpp"
 #include "adjoint/linearised_zone.hpp"
 #include "math/rotation.hpp"
+#include "zone/chart.hpp"
+#include "zone/elasticity.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
 
-/// Hard contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
+/// Exact contacts: J z = 0 with reactions r, H z + Jᵀ r = v, by proximal steps r += stiffness * J z on the system that
 /// gives way. Every step leaves about a compliance's part; they end when z no longer changes, since a small J z alone
 /// does not mean that z is right. Returns the reactions, the last step's left out: the soft contacts carry it.
 template <typename SolveInPlace>
-std::vector<double> harden(
+std::vector<double> find_reactions(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const SolveInPlace& solve_in_place,
     Coordinates& z) {
     constexpr int kMaxSteps = 30;
@@ -65,19 +68,19 @@ std::vector<double> harden(
     return reactions;
 }
 
-/// Overwrite the upstream gradient by z. Returns the reactions of contacts, if they are hard.
+/// Overwrite the upstream gradient by z. Returns the reactions of contacts, if they are exact.
 template <typename SolveInPlace>
 std::vector<double> solve(
     const Zone& zone, const ZonePoint& point, Coordinates& z, const SolveInPlace& solve_in_place) {
-    const Coordinates upstream = zone.hard ? z : Coordinates();
+    const Coordinates upstream = zone.exact_contact ? z : Coordinates();
     solve_in_place(z);
-    return zone.hard ? harden(zone, point, upstream, solve_in_place, z) : std::vector<double>();
+    return zone.exact_contact ? find_reactions(zone, point, upstream, solve_in_place, z) : std::vector<double>();
 }
 
 /// What the contacts of a body that yields take of the upstream gradient v, along its twist J dy at the end of the step.
 /// With H = M + C + Jᵀ K J the matrix of  H z = v,  K of the contacts and C the curvature of the chart under their torque:
 ///     K J z + Jᵀ⁻¹ (M + C) z = Jᵀ⁻¹ v.
-/// Of hard contacts, whose reactions stand beside H z, they are part of it.
+/// Of exact contacts, whose reactions stand beside H z, they are part of it.
 Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, const Vec6& v, const Vec6& z) {
     Vec6 share = v;
     share.head<3>() -= body.inertia * z.head<3>();
@@ -93,8 +96,8 @@ Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, cons
 
 /// What contacts add to the gradients of masses through their stiffness, between bodies and with the ground.
 void add_body_stiffness(
-    const Zone& zone, const std::vector<BodyContacts>& contacts, const std::vector<Vec6>& twist, ZoneAdjoint& result) {
-    for (const BodyContacts& c : contacts) {
+    const Zone& zone, const std::vector<PairSums>& contacts, const std::vector<Vec6>& twist, ZoneAdjoint& result) {
+    for (const PairSums& c : contacts) {
         double along = 0.0;
         for (const auto& [body, part] : {std::pair<int, Vec6>(c.a, c.gradient.head<6>()), {c.b, c.gradient.tail<6>()}})
             if (zone.yields(body)) along += part.dot(twist[body]);
@@ -104,7 +107,7 @@ void add_body_stiffness(
 }
 
 /// What contacts add to the gradients: to those of places that the linear system has no rows for, `twist` times their
-/// second derivatives and the reactions of hard ones; with cloth, to those of masses, through their stiffness.
+/// second derivatives and the reactions of exact ones; with cloth, to those of masses, through their stiffness.
 /// `multipliers`: stiffness times what opens each contact along `twist`, where contacts are rows of constant direction;
 /// null where they have curvature.
 void add_contacts(
@@ -113,10 +116,9 @@ void add_contacts(
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
-        const bool of_bodies = zone.yields(contact.a) && (contact.contact.with_ground() || zone.yields(contact.b));
-        const bool with_place = needs.place && !of_bodies;
-        // A hard contact's stiffness is only how its multiplier was found.
-        const bool through_stiffness = needs.mass && !zone.hard && (contact.cloth_a >= 0 || contact.cloth_b >= 0);
+        const bool with_place = needs.place && !is_of_yielding_bodies(zone, contact);
+        // An exact contact's stiffness is only how its multiplier was found.
+        const bool through_stiffness = needs.mass && !zone.exact_contact && contact.has_cloth();
         if (!with_place && !through_stiffness) continue;
         const ContactTerm term =
             contact_term(zone, point, active, with_place && multipliers == nullptr ? Curvature::full : Curvature::none);
@@ -130,17 +132,18 @@ void add_contacts(
                 gradient = term.hessian.lazyProduct(motion);  // of this size a library call is slower
             else
                 gradient = (*multipliers)[static_cast<Eigen::Index>(k)] * term.row;
-            if (zone.hard) gradient += reactions[k] * term.row;
+            if (zone.exact_contact) gradient += reactions[k] * term.row;
             term.for_each(
                 [&](int body, int offset) {
-                    if (!zone.yields(body)) result.place_gradient.bodies[body] -= gradient.segment<6>(offset);
+                    if (!zone.yields(body)) result.pose_gradient.bodies[body] -= gradient.segment<6>(offset);
                 },
-                [&](int node, int offset) { result.place_gradient.nodes[node] -= gradient.segment<3>(offset); });
+                [&](int node, int offset) { result.pose_gradient.nodes[node] -= gradient.segment<3>(offset); });
         }
         if (!through_stiffness) continue;
         const double along = term.gradient.dot(motion);
         for (std::size_t s = 0; s < static_cast<std::size_t>(term.side_count); ++s) {
-            const double part = -along * (s == 0 ? contact.stiffness.log_gradient_a : contact.stiffness.log_gradient_b);
+            const double part =
+                -along * (s == 0 ? contact.law.stiffness.log_gradient_a : contact.law.stiffness.log_gradient_b);
             if (zone.yields(term.sides[s].body)) result.mass_gradient[term.sides[s].body] += part;
             for (int node : term.sides[s].nodes)
                 if (node >= 0) result.node_mass_gradient[node] += part;
@@ -148,26 +151,66 @@ void add_contacts(
     }
 }
 
-/// What elasticity adds to the gradients: z times its second derivatives.
-void add_elasticity(const Zone& zone, const ZonePoint& point, const GradientNeeds& needs, ZoneAdjoint& result) {
-    const double scale = -zone.dt * zone.dt;
-    std::vector<Vec3> start;
-    for (const ZoneNode& node : zone.nodes) start.push_back(node.start);
-    for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c) {
-        const ZoneCloth& part = zone.cloths[c];
-        const ClothParameters& parameters = (*zone.cloth_parameters)[part.id];
-        const Vec3* x = point.nodes.data() + part.first_node;
-        const Vec3* z = result.multiplier.nodes.data() + part.first_node;
-        if (needs.place)
-            add_elastic_hessian_product(
-                zone.cloth(c), parameters, zone.dt, part.start, x, z, scale,
-                result.place_gradient.nodes.data() + part.first_node);
-        const bool through_damping = needs.place && parameters.damping > 0.0;
-        if (!needs.material && !through_damping) continue;
-        result.cloth_gradient[static_cast<std::size_t>(c)] = add_elastic_backward(
-            zone.cloth(c), parameters, zone.dt, part.start, x, start.data() + part.first_node, z, scale,
-            result.start_gradient.data() + part.first_node);
+/// The bodies that yield: their part of the gradient of poses, and how they move along z at the end of the step.
+void add_bodies(
+    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, const std::vector<Vec3>* torques,
+    const GradientNeeds& needs, std::vector<Vec6>& twist, ZoneAdjoint& result) {
+    twist.assign(zone.bodies.size(), Vec6::Zero());
+    for (int i = 0; i < zone.dynamic_count; ++i) {
+        twist[i] = result.multiplier.bodies[i];
+        twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();
     }
+    for (int i = 0; i < zone.dynamic_count && needs.place; ++i) {
+        const Vec3 torque = torques != nullptr ? (*torques)[i] : Vec3(Vec3::Zero());
+        Vec6& gradient = result.pose_gradient.bodies[i];
+        gradient =
+            -contact_share(zone.bodies[i], point.y.bodies[i], torque, upstream.bodies[i], result.multiplier.bodies[i]);
+        // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
+        gradient.head<3>() -= 0.5 * torque.cross(twist[i].head<3>());
+    }
+}
+
+/// What a solve for z finds beside it.
+struct Multipliers {
+    std::vector<double> reactions;  ///< of exact contacts
+    VectorX rows;                   ///< stiffness times what opens each contact along z, where contacts are rows
+};
+
+/// Overwrite the multiplier of the workspace's result, the upstream gradient, by z.
+Multipliers solve_exactly(const Zone& zone, const ZonePoint& point, AdjointWorkspace& workspace) {
+    BlockSystem& system = workspace.system;
+    system.set_pattern(base_pattern(zone));
+    differentiate(zone, point, Curvature::full, workspace.derivatives, &system);
+    if (!system.factorize()) {
+        // Only where the forward stopped short of a minimum. Without negative curvature the answer stays finite.
+        differentiate(zone, point, Curvature::full, workspace.derivatives, &system, kAllCut);
+        system.factorize();
+    }
+    const auto in_place = [&](Coordinates& z) { system.solve_in_place(z); };
+    return {solve(zone, point, workspace.result.multiplier, in_place), {}};
+}
+
+/// The same with contacts as rows.
+Multipliers solve_linearised(const Zone& zone, const ZonePoint& point, AdjointMode mode, ZoneAdjoint& result) {
+    const LinearisedSolver solver(zone, point, mode);
+    Multipliers multipliers;
+    multipliers.reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) {
+        KktSolution solution = solver.solve(z);
+        z = std::move(solution.z);
+        multipliers.rows = std::move(solution.multipliers);
+    });
+    return multipliers;
+}
+
+void start_result(const Zone& zone, const Coordinates& upstream, ZoneAdjoint& result) {
+    result.multiplier = upstream;
+    for (int i = 0; i < zone.node_count(); ++i)
+        if (zone.nodes[i].pinned) result.multiplier.nodes[i].setZero();
+    result.pose_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
+    result.start_gradient.assign(zone.nodes.size(), Vec3::Zero());
+    result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
+    result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
+    result.cloth_gradient.assign(zone.cloths.size(), ClothParameters{});
 }
 
 }  // namespace
@@ -176,58 +219,23 @@ const ZoneAdjoint& zone_adjoint(
     const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
     AdjointWorkspace& workspace) {
     const bool exact = mode == AdjointMode::exact;
-    BlockSystem& system = workspace.system;
     ZoneDerivatives& derivatives = workspace.derivatives;
     ZoneAdjoint& result = workspace.result;
     std::vector<Vec6>& twist = workspace.twist;
-    result.multiplier = upstream;
-    for (int i = 0; i < zone.node_count(); ++i)
-        if (zone.nodes[i].pinned) result.multiplier.nodes[i].setZero();
-    std::vector<double> reactions;
-    VectorX multipliers;
-    if (exact) {
-        system.set_pattern(base_pattern(zone));
-        differentiate(zone, point, Curvature::full, derivatives, &system);
-        if (!system.factorize()) {
-            // Only where the forward stopped short of a minimum. Without negative curvature the answer stays finite.
-            differentiate(zone, point, Curvature::full, derivatives, &system, kAllCut);
-            system.factorize();
-        }
-        reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) { system.solve_in_place(z); });
-    } else {
-        const LinearisedSolver solver(zone, point, mode);
-        reactions = solve(zone, point, result.multiplier, [&](Coordinates& z) {
-            KktSolution solution = solver.solve(z);
-            z = std::move(solution.z);
-            multipliers = std::move(solution.multipliers);
-        });
-    }
-
-    result.place_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
-    result.start_gradient.assign(zone.nodes.size(), Vec3::Zero());
-    result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
-    result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
-    result.cloth_gradient.assign(zone.cloths.size(), ClothParameters{});
-    twist.assign(zone.bodies.size(), Vec6::Zero());
-    for (int i = 0; i < zone.dynamic_count; ++i) {
-        twist[i] = result.multiplier.bodies[i];
-        twist[i].head<3>() = left_jacobian(point.y.bodies[i].head<3>()) * result.multiplier.bodies[i].head<3>();
-    }
-    for (int i = 0; i < zone.dynamic_count && needs.place; ++i) {
-        const Vec3 torque = exact ? derivatives.torque[i] : Vec3(Vec3::Zero());
-        Vec6& gradient = result.place_gradient.bodies[i];
-        gradient =
-            -contact_share(zone.bodies[i], point.y.bodies[i], torque, upstream.bodies[i], result.multiplier.bodies[i]);
-        // A turn of the base turns the torque too: d(torque) = (H - ½ [torque]x) phi with H symmetric.
-        gradient.head<3>() -= 0.5 * torque.cross(twist[i].head<3>());
-    }
-    if (needs.mass && !zone.hard) {
+    start_result(zone, upstream, result);
+    const Multipliers multipliers =
+        exact ? solve_exactly(zone, point, workspace) : solve_linearised(zone, point, mode, result);
+    add_bodies(zone, point, upstream, exact ? &derivatives.torque : nullptr, needs, twist, result);
+    if (needs.mass && !zone.exact_contact) {
         if (!exact) differentiate(zone, point, Curvature::none, derivatives, nullptr);
-        add_body_stiffness(zone, derivatives.body_contacts, twist, result);
+        add_body_stiffness(zone, derivatives.pair_sums, twist, result);
     }
     if (needs.place || needs.mass)
-        add_contacts(zone, point, exact ? nullptr : &multipliers, needs, twist, reactions, result);
-    if (!zone.cloths.empty() && zone.elastic) add_elasticity(zone, point, needs, result);
+        add_contacts(zone, point, exact ? nullptr : &multipliers.rows, needs, twist, multipliers.reactions, result);
+    if (!zone.cloths.empty() && zone.elastic)
+        add_elastic_backward(
+            zone, point, result.multiplier.nodes, needs.place, needs.material,
+            {result.pose_gradient.nodes, result.start_gradient, result.cloth_gradient});
     return result;
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
 /// Backward of a zone: implicit differentiation of its optimality condition dE/dy = 0, not of the iterations.
 ///
@@ -25,7 +25,7 @@ struct ZoneAdjoint {
     Coordinates multiplier;  ///< z, one per dynamic body and node; zero at pinned nodes
     /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone, those
     /// that do not yield included, along its twist at the end of the step; one per node.
-    Coordinates place_gradient;
+    Coordinates pose_gradient;
     std::vector<Vec3> start_gradient;             ///< one per node: through the strains that damping is measured from
     std::vector<double> mass_gradient;            ///< through the contacts' stiffness, one per dynamic body
     std::vector<double> node_mass_gradient;       ///< the same, one per node

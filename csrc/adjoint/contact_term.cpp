@@ -1,89 +1,58 @@
 #include "adjoint/contact_term.hpp"
 
+#include "zone/sides_of.hpp"
+
 namespace diffsim {
 namespace {
 
-class ContactTermMaker {
-public:
-    ContactTermMaker(const Zone& zone, const ZonePoint& point) : m_zone(zone), m_point(point) {}
+void set(ContactTerm::Side& side, const PlacedSide<BodySide>& placed) { side.body = placed.body; }
+void set(ContactTerm::Side& side, const PlacedSide<ClothSide>& placed) { side.nodes = placed.nodes; }
 
-    ContactTerm operator()(const ActiveContact& active, Curvature curvature) const {
-        const ZoneContact& contact = m_zone.contacts[active.index];
-        ContactTerm term;
-        if (contact.contact.with_ground()) {
-            term.side_count = 1;
-            if (contact.cloth_a >= 0)
-                node_on_ground(contact, active, term);
-            else
-                body_on_ground(contact, active, term);
-            return term;
-        }
-        if (contact.cloth_a >= 0)
-            fill(
-                contact, active, curvature, cloth(contact, active, true, term), cloth(contact, active, false, term),
-                term);
-        else if (contact.cloth_b >= 0)
-            fill(contact, active, curvature, body(contact.a, 0, term), cloth(contact, active, false, term), term);
-        else
-            fill(contact, active, curvature, body(contact.a, 0, term), body(contact.b, 1, term), term);
-        return term;
-    }
+template <class A, class B>
+void fill(
+    const ContactLaw& law, const ContactGeometry& geometry, Curvature curvature, const PlacedSide<A>& a,
+    const PlacedSide<B>& b, ContactTerm& term) {
+    set(term.sides[0], a);
+    set(term.sides[1], b);
+    term.sides[1].offset = A::kSize;
+    const bool with_hessian = curvature != Curvature::none;
+    const auto d = contact_derivatives(geometry, law, a.side, b.side, with_hessian, curvature != Curvature::dropped);
+    term.row = d.row;
+    term.gradient = d.gradient;
+    if (with_hessian) term.hessian = d.hessian;
+    term.stiffness = d.stiffness;
+}
 
-private:
-    BodySide body(int index, std::size_t side, ContactTerm& term) const {
-        term.sides[side].body = index;
-        return {m_point.poses[index].t};
-    }
-    ClothSide cloth(const ZoneContact& contact, const ActiveContact& active, bool of_a, ContactTerm& term) const {
-        term.sides[of_a ? 0 : 1].nodes = feature_nodes(m_zone, contact, of_a);
-        const Surface surface = of_a ? surface_a(m_zone, contact, m_point.poses, m_point.nodes)
-                                     : surface_b(m_zone, contact, m_point.poses, m_point.nodes);
-        return cloth_side(contact.contact, active.geometry, surface, of_a);
-    }
+void fill(
+    const ContactLaw& law, const ContactGeometry& geometry, Curvature, const PlacedSide<BodySide>& a,
+    const PlacedSide<GroundSide>&, ContactTerm& term) {
+    term.side_count = 1;
+    set(term.sides[0], a);
+    term.row = GroundSums::row(geometry.closest.a.point - a.side.center);
+    term.stiffness = normal_force(law, geometry.distance).stiffness;
+}
 
-    template <class A, class B>
-    static void fill(
-        const ZoneContact& contact, const ActiveContact& active, Curvature curvature, const A& a, const B& b,
-        ContactTerm& term) {
-        term.sides[1].offset = A::kSize;
-        const bool with_hessian = curvature != Curvature::none;
-        const auto d = contact_derivatives(
-            active.geometry, contact.range, contact.stiffness.value, a, b, with_hessian,
-            curvature != Curvature::dropped);
-        term.row = d.row;
-        term.gradient = d.gradient;
-        if (with_hessian) term.hessian = d.hessian;
-        term.stiffness = d.stiffness;
-    }
-
-    void body_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
-        term.sides[0].body = contact.a;
-        term.row = GroundContacts::row(active.geometry.closest.point_a - m_point.poses[contact.a].t);
-        term.stiffness = contact_potential(
-                             contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
-                             contact.stiffness.value)
-                             .stiffness;
-    }
-
-    void node_on_ground(const ZoneContact& contact, const ActiveContact& active, ContactTerm& term) const {
-        term.sides[0].nodes = feature_nodes(m_zone, contact, true);
-        const PotentialValue potential = contact_potential(
-            contact.range.rest - active.geometry.distance, contact.range.rest - contact.range.pole,
-            contact.stiffness.value);
-        term.row = Vec3::UnitZ();
-        term.gradient = -potential.force * term.row;
-        term.hessian = potential.stiffness * term.row * term.row.transpose();
-        term.stiffness = potential.stiffness;
-    }
-
-    const Zone& m_zone;
-    const ZonePoint& m_point;
-};
+void fill(
+    const ContactLaw& law, const ContactGeometry& geometry, Curvature, const PlacedSide<ClothSide>& a,
+    const PlacedSide<GroundSide>&, ContactTerm& term) {
+    term.side_count = 1;
+    set(term.sides[0], a);
+    const PotentialValue potential = normal_force(law, geometry.distance);
+    term.row = Vec3::UnitZ();
+    term.gradient = -potential.force * term.row;
+    term.hessian = potential.stiffness * term.row * term.row.transpose();
+    term.stiffness = potential.stiffness;
+}
 
 }  // namespace
 
 ContactTerm contact_term(const Zone& zone, const ZonePoint& point, const ActiveContact& active, Curvature curvature) {
-    return ContactTermMaker(zone, point)(active, curvature);
+    const ZoneContact& contact = zone.contacts[active.index];
+    ContactTerm term;
+    with_placed_sides(zone, contact, active.geometry, point.poses, point.nodes, [&](const auto& a, const auto& b) {
+        fill(contact.law, active.geometry, curvature, a, b, term);
+    });
+    return term;
 }
 
 }  // namespace diffsim

@@ -1,7 +1,8 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
+/// What the backward of a zone needs of each active contact.
 namespace diffsim {
 
 /// Vectors and matrices of up to two features of cloth, on the stack.

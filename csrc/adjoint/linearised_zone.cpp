@@ -6,6 +6,8 @@
 #include <optional>
 
 #include "adjoint/contact_term.hpp"
+#include "zone/chart.hpp"
+#include "zone/elasticity.hpp"
 
 namespace diffsim {
 namespace {
@@ -101,7 +103,7 @@ MatrixX cloth_matrix(const Zone& zone, const ZonePoint& point, const FreeCoordin
     MatrixX matrix = MatrixX::Zero(size, size);
     if (size == 0) return matrix;
     BlockSystem cloth;
-    cloth.set_pattern(cloth_pattern(zone));
+    cloth.set_pattern(elastic_pattern(zone));
     cloth.set_zero();
     if (zone.elastic) add_elastic_hessian(zone, point, cut, cloth);
     for (int i = 0; i < zone.node_count(); ++i) {

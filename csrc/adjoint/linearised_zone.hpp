@@ -2,7 +2,7 @@
 
 #include <memory>
 
-#include "zone/zone.hpp"
+#include "zone/zone_point.hpp"
 
 /// The zone as the paper linearises it: contacts are rows of constant direction.
 namespace diffsim {

@@ -6,6 +6,7 @@
 namespace diffsim::bindings {
 
 void bind_collision(pybind11::module_& module);
+void bind_contacts(pybind11::module_& module);
 void bind_model(pybind11::module_& module);
 void bind_rollout(pybind11::module_& module);
 

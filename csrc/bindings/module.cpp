@@ -5,4 +5,5 @@ PYBIND11_MODULE(_core, module) {
     diffsim::bindings::bind_model(module);
     diffsim::bindings::bind_collision(module);
     diffsim::bindings::bind_rollout(module);
+    diffsim::bindings::bind_contacts(module);
 }

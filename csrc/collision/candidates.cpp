@@ -266,7 +266,7 @@ public:
 
     bool operator()(const FeaturePair& pair) {
         const ClosestPoints points = closest(pair);
-        const Vec3 offset = points.point_a - points.point_b;
+        const Vec3 offset = points.a.point - points.b.point;
         const double distance = offset.norm();
         if (!(distance > m_a.reach + m_b.reach)) return false;
         const Vec3 normal = offset / distance;
@@ -287,7 +287,7 @@ private:
                 m_feature_a.place_patch(m_a, pair.feature_a);
                 m_feature_b.place_vertex(m_b, pair.feature_b);
                 ClosestPoints points = closest_vertex_polygon(m_feature_b.begin[0], m_feature_a.polygon());
-                std::swap(points.point_a, points.point_b);
+                std::swap(points.a.point, points.b.point);
                 return points;
             }
             case ContactType::edge_edge:

@@ -124,7 +124,7 @@ struct VertexPolygon {
     double turning_reach(const ClosestPoints& points, const Vec3& offset, double begin, double end, double keep) const {
         const Line* corner = features.b;
         const Vectors<2> vertex = features.a->over(begin, end);
-        if (points.slide_count_b == 2) {
+        if (points.b.slide_count == 2) {
             Vectors<3> normal{Vec3::Zero(), Vec3::Zero(), Vec3::Zero()};
             const Vectors<2> first = corner[0].over(begin, end);
             for (int k = 1; k + 1 < features.count_b; ++k) {
@@ -137,7 +137,7 @@ struct VertexPolygon {
         }
         const int k = static_cast<int>(points.feature_code - 1) / 3;
         const Vectors<2> nearest = corner[k].over(begin, end), from_nearest = difference(vertex, nearest);
-        if (points.slide_count_b == 0) return diffsim::turning_reach(features, from_nearest, offset, begin, end, keep);
+        if (points.b.slide_count == 0) return diffsim::turning_reach(features, from_nearest, offset, begin, end, keep);
         const Vectors<2> next = corner[k + 1 < features.count_b ? k + 1 : 0].over(begin, end);
         return diffsim::turning_reach(
             features, edge_normal(difference(next, nearest), from_nearest), offset, begin, end, keep);
@@ -159,15 +159,15 @@ struct EdgeEdge {
         const Vectors<2> b0 = b[0].over(begin, end), b1 = b[1].over(begin, end);
         const Vectors<2> edge_a = difference(a1, a0), edge_b = difference(b1, b0);
         // A point on the border of its edge is an end: there edges may be as good as parallel, without a common normal.
-        const bool inside_a = points.slide_count_a > points.border_count_a;
-        const bool inside_b = points.slide_count_b > points.border_count_b;
+        const bool inside_a = points.a.slide_count > points.a.border_count;
+        const bool inside_b = points.b.slide_count > points.b.border_count;
         if (inside_a && inside_b)
             return diffsim::turning_reach(features, bernstein_product(edge_a, edge_b, cross), offset, begin, end, keep);
         const auto is_first = [](const Vec3& point, const Vectors<2>& first, const Vectors<2>& second) {
             return (point - first[0]).squaredNorm() < (point - second[0]).squaredNorm();
         };
-        const Vectors<2>& end_a = is_first(points.point_a, a0, a1) ? a0 : a1;
-        const Vectors<2>& end_b = is_first(points.point_b, b0, b1) ? b0 : b1;
+        const Vectors<2>& end_a = is_first(points.a.point, a0, a1) ? a0 : a1;
+        const Vectors<2>& end_b = is_first(points.b.point, b0, b1) ? b0 : b1;
         if (inside_a)
             return diffsim::turning_reach(
                 features, edge_normal(edge_a, difference(end_b, a0)), offset, begin, end, keep);
@@ -201,7 +201,7 @@ CcdResult advance(const Pair& pair, const CcdOptions& options) {
     double time = 0.0, span = 1.0;
     for (int k = 0; k < options.max_iterations; ++k) {
         const ClosestPoints points = pair.closest(time);
-        const Vec3 offset = points.point_a - points.point_b;
+        const Vec3 offset = points.a.point - points.b.point;
         const double distance = offset.norm();
         if (!(distance > near)) return {time, k};
         double next = time + fixed_reach(pair.features, (1.0 / distance) * offset, time, options.until, keep);

@@ -41,10 +41,7 @@ struct Ends {
 
 ClosestPoints swapped(const ClosestPoints& points) {
     ClosestPoints result = points;
-    std::swap(result.point_a, result.point_b);
-    std::swap(result.slide_count_a, result.slide_count_b);
-    std::swap(result.border_count_a, result.border_count_b);
-    std::swap(result.edge_a, result.edge_b);
+    std::swap(result.a, result.b);
     return result;
 }
 
@@ -58,8 +55,8 @@ ClosestPoints vertex_against_patch(const Surface& v, int vertex, const Surface& 
 
 ClosestPoints vertex_above_ground(const Vec3& vertex, double ground_height) {
     ClosestPoints points;
-    points.point_a = vertex;
-    points.point_b = Vec3(vertex.x(), vertex.y(), ground_height);
+    points.a.point = vertex;
+    points.b.point = Vec3(vertex.x(), vertex.y(), ground_height);
     return points;
 }
 
@@ -82,15 +79,15 @@ ClosestPoints closest_points(const Contact& contact, const Surface& a, const Sur
 ContactGeometry::ContactGeometry(const Contact& contact, const Surface& a, const Surface& b, double ground_height)
     : closest(closest_points(contact, a, b, ground_height)) {
     if (contact.with_ground()) {
-        distance = closest.point_a.z() - ground_height;
+        distance = closest.a.point.z() - ground_height;
         normal = Vec3::UnitZ();
         return;
     }
-    const Vec3 offset = closest.point_a - closest.point_b;
+    const Vec3 offset = closest.a.point - closest.b.point;
     distance = offset.norm();
     normal = distance > 0.0 ? Vec3((1.0 / distance) * offset) : Vec3(Vec3::Zero());
     if (contact.type == ContactType::edge_edge) {
-        const Vec3 &da = closest.edge_a, &db = closest.edge_b;
+        const Vec3 &da = closest.a.edge, &db = closest.b.edge;
         const double value = da.cross(db).squaredNorm() / (da.squaredNorm() * db.squaredNorm());
         sine_sq = value > kRoundedSineSq ? value : 0.0;
     }
@@ -126,19 +123,16 @@ double contact_toi(
         .toi;
 }
 
-std::array<int, 3> feature_vertices(const CollisionMesh& mesh, const Contact& contact, bool of_a) {
-    const int feature = of_a ? contact.feature_a : contact.feature_b;
-    switch (contact.type) {
-        case ContactType::edge_edge:
-            return {mesh.edges[feature].p0, mesh.edges[feature].p1, -1};
-        case ContactType::vertex_patch:
-            if (of_a) return {feature, -1, -1};
-            break;
-        case ContactType::patch_vertex:
-            if (!of_a) return {feature, -1, -1};
+std::array<int, 3> feature_vertices(const CollisionMesh& mesh, const Feature& feature) {
+    switch (feature.kind) {
+        case FeatureKind::vertex:
+            return {feature.index, -1, -1};
+        case FeatureKind::edge:
+            return {mesh.edges[feature.index].p0, mesh.edges[feature.index].p1, -1};
+        case FeatureKind::patch:
             break;
     }
-    const std::vector<int>& loop = mesh.patches[feature].vertices;
+    const std::vector<int>& loop = mesh.patches[feature.index].vertices;
     return {loop[0], loop[1], loop[2]};
 }
 

@@ -3,7 +3,7 @@
 #include <Eigen/Geometry>
 
 #include "collision/candidates.hpp"
-#include "contact/potential.hpp"
+#include "contact/law.hpp"
 #include "geometry/distance.hpp"
 #include "model/model.hpp"
 
@@ -12,6 +12,14 @@ namespace diffsim {
 
 struct CcdOptions;
 
+enum class FeatureKind : std::uint8_t { vertex, edge, patch };
+
+/// A feature of a mesh.
+struct Feature {
+    FeatureKind kind;
+    int index;
+};
+
 /// Which features of which objects. Objects are numbered as in Model::object_count, or kGround for object_b.
 struct Contact {
     int object_a, object_b;
@@ -19,10 +27,18 @@ struct Contact {
     int feature_a, feature_b;  ///< feature_b is -1 with the ground
 
     bool with_ground() const { return object_b == kGround; }
+    Feature on_a() const {
+        const FeatureKind other = type == ContactType::vertex_patch ? FeatureKind::vertex : FeatureKind::patch;
+        return {type == ContactType::edge_edge ? FeatureKind::edge : other, feature_a};
+    }
+    Feature on_b() const {
+        const FeatureKind other = type == ContactType::vertex_patch ? FeatureKind::patch : FeatureKind::vertex;
+        return {type == ContactType::edge_edge ? FeatureKind::edge : other, feature_b};
+    }
 };
 
-/// What the multiplier of a hard contact follows from: it acts as one with this compliance and its rest distance shifted.
-struct HardContact {
+/// What the multiplier of an exact contact follows from: it acts as one with this compliance and its rest distance shifted.
+struct ExactContact {
     double shift;  ///< [m]
     double compliance;
 };
@@ -63,7 +79,7 @@ double contact_toi(
     const Contact& contact, const SweptSurface& a, const SweptSurface& b, double ground_height,
     const CcdOptions& options);
 
-/// The vertices of one of a contact's features, up to three of a cloth's; -1 fills the rest.
-std::array<int, 3> feature_vertices(const CollisionMesh& mesh, const Contact& contact, bool of_a);
+/// The vertices of a feature, up to three of a cloth's; -1 fills the rest.
+std::array<int, 3> feature_vertices(const CollisionMesh& mesh, const Feature& feature);
 
 }  // namespace diffsim

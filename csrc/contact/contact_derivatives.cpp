@@ -11,125 +11,6 @@
 namespace diffsim {
 namespace {
 
-template <int N>
-using Rows3 = Eigen::Matrix<double, 3, N>;
-
-/// ½ (r nᵀ + n rᵀ) - (n·r) I: second derivative of n · Exp(phi) r at phi = 0.
-Mat3 turn_curvature(const Vec3& r, const Vec3& n) {
-    Mat3 m = 0.5 * (r * n.transpose() + n * r.transpose());
-    m.diagonal().array() -= n.dot(r);
-    return m;
-}
-
-/// How the turn of a rigid body moves the closest point on it and the directions of its features. Of two bodies only their
-/// relative shift matters, so that of one of them the turn is enough.
-class TurnMotion {
-public:
-    static constexpr int kSize = 3;
-    static constexpr int kTurnSize = 3;  ///< the first coordinates, which alone change directions
-    TurnMotion(const BodySide& side, const Vec3& point) : m_arm(point - side.center) {}
-
-    /// n · d(point).
-    Vec3 row(const Vec3& n) const { return m_arm.cross(n); }
-    /// n · d²(point).
-    Mat3 point_curvature(const Vec3& n) const { return turn_curvature(m_arm, n); }
-    /// n · d(slide direction k).
-    Vec3 slide(int, const Vec3& direction, const Vec3& n) const { return direction.cross(n); }
-    /// d(unit direction of an edge).
-    Mat3 direction(const Vec3& unit) const { return -skew(unit); }
-    /// other · d²(unit direction of an edge).
-    Mat3 direction_curvature(const Vec3& unit, const Vec3& other) const { return turn_curvature(unit, other); }
-
-private:
-    Vec3 m_arm;
-};
-
-/// The same for turn and shift of a rigid body.
-class BodyMotion {
-public:
-    static constexpr int kSize = 6;
-    static constexpr int kTurnSize = 3;
-    BodyMotion(const BodySide& side, const Vec3& point) : m_turn(side, point) {}
-
-    Vec6 row(const Vec3& n) const {
-        Vec6 result;
-        result << m_turn.row(n), n;
-        return result;
-    }
-    Mat3 point_curvature(const Vec3& n) const { return m_turn.point_curvature(n); }
-    Vec3 slide(int k, const Vec3& direction, const Vec3& n) const { return m_turn.slide(k, direction, n); }
-    Mat3 direction(const Vec3& unit) const { return m_turn.direction(unit); }
-    Mat3 direction_curvature(const Vec3& unit, const Vec3& other) const {
-        return m_turn.direction_curvature(unit, other);
-    }
-
-private:
-    TurnMotion m_turn;
-};
-
-/// The same for the nodes of a cloth's feature.
-class ClothMotion {
-public:
-    static constexpr int kSize = 9;
-    static constexpr int kTurnSize = 9;
-    ClothMotion(const ClothSide& side, const Vec3&) : m_side(side) {}
-
-    Vector<9> row(const Vec3& n) const { return weighted(m_side.weights, n); }
-    Vector<9> slide(int k, const Vec3&, const Vec3& n) const { return weighted(m_side.slide[k], n); }
-    Rows3<9> direction(const Vec3& unit) const {
-        const Mat3 projector = (Mat3::Identity() - unit * unit.transpose()) / m_side.edge_length;
-        Rows3<9> result;
-        result << -projector, projector, Mat3::Zero();
-        return result;
-    }
-    Square<9> direction_curvature(const Vec3& unit, const Vec3& other) const {
-        // d²(other · e / |e|) with e the edge
-        const double cosine = unit.dot(other);
-        const Mat3 block = (3.0 * cosine * unit * unit.transpose() - other * unit.transpose() -
-                            unit * other.transpose() - cosine * Mat3::Identity()) /
-                           (m_side.edge_length * m_side.edge_length);
-        Square<9> result = Square<9>::Zero();
-        result.topLeftCorner<3, 3>() = block;
-        result.block<3, 3>(3, 3) = block;
-        result.block<3, 3>(0, 3) = -block;
-        result.block<3, 3>(3, 0) = -block;
-        return result;
-    }
-
-private:
-    static Vector<9> weighted(const Vec3& weights, const Vec3& n) {
-        Vector<9> result;
-        result << weights[0] * n, weights[1] * n, weights[2] * n;
-        return result;
-    }
-
-    const ClothSide& m_side;
-};
-
-BodyMotion motion_of(const BodySide& side, const Vec3& point) { return {side, point}; }
-ClothMotion motion_of(const ClothSide& side, const Vec3& point) { return {side, point}; }
-
-/// direction · d(point_a - point_b).
-template <class A, class B>
-Vector<A::kSize + B::kSize> relative_row(const A& a, const B& b, const Vec3& direction) {
-    Vector<A::kSize + B::kSize> row;
-    row << a.row(direction), -b.row(direction);
-    return row;
-}
-
-/// Orthonormal directions along which the closest point of an object slides, as many as its count says. On the border of
-/// a face the first runs along it.
-std::array<Vec3, 2> slide_directions(const ContactGeometry& geometry, bool of_a) {
-    const ClosestPoints& points = geometry.closest;
-    const int count = of_a ? points.slide_count_a : points.slide_count_b;
-    if (count == 0) return {Vec3::Zero(), Vec3::Zero()};
-    const Vec3& edge = of_a ? points.edge_a : points.edge_b;
-    if (count == 1) return {edge.normalized(), Vec3::Zero()};
-    const bool on_border = (of_a ? points.border_count_a : points.border_count_b) == 1;
-    const Vec3 first = on_border ? Vec3(edge.normalized()) : geometry.normal.unitOrthogonal();
-    return {first, geometry.normal.cross(first)};
-}
-
 /// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|, of which a closest
 /// point has as many as its count. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is
 /// orthogonal to S and n:
@@ -150,7 +31,8 @@ void add_slide_hessian(
         add_tangent(n.cross(tangent));
         return;
     }
-    const std::array<Vec3, 2> slides_a = slide_directions(geometry, true), slides_b = slide_directions(geometry, false);
+    const std::array<Vec3, 2> slides_a = slide_directions(geometry.closest.a, n),
+                              slides_b = slide_directions(geometry.closest.b, n);
     std::array<Vec3, 2> S;
     std::array<Vector<A::kTurnSize>, 2> q_a;
     std::array<Vector<B::kTurnSize>, 2> q_b;
@@ -194,14 +76,13 @@ template <class A, class B>
 void add_distance_hessian(
     const ContactGeometry& geometry, const A& a, const B& b, double factor,
     HalfSymmetric<A::kSize + B::kSize>& hessian) {
-    // Nodes move on straight lines: only points on bodies have a curvature of their own.
     if constexpr (!std::is_same_v<A, ClothMotion>)
         hessian.template block<3, 3>(0, 0) += (0.5 * factor) * a.point_curvature(geometry.normal);
     if constexpr (!std::is_same_v<B, ClothMotion>)
         hessian.template block<3, 3>(A::kSize, A::kSize) -= (0.5 * factor) * b.point_curvature(geometry.normal);
     const ClosestPoints& points = geometry.closest;
-    const int count_a = points.slide_count_a, border_a = points.border_count_a;
-    const int count_b = points.slide_count_b, border_b = points.border_count_b;
+    const int count_a = points.a.slide_count, border_a = points.a.border_count;
+    const int count_b = points.b.slide_count, border_b = points.b.border_count;
     if (border_a + border_b == 0) {
         add_slide_hessian(geometry, a, b, count_a, count_b, factor, hessian);
     } else {
@@ -226,8 +107,8 @@ struct Angle {
     Angle(const ContactGeometry& geometry, const A& motion_a, const B& motion_b)
         : a(motion_a),
           b(motion_b),
-          direction_a(geometry.closest.edge_a.normalized()),
-          direction_b(geometry.closest.edge_b.normalized()),
+          direction_a(geometry.closest.a.edge.normalized()),
+          direction_b(geometry.closest.b.edge.normalized()),
           cosine(direction_a.dot(direction_b)),
           turn_a(a.direction(direction_a)),
           turn_b(b.direction(direction_b)),
@@ -248,65 +129,17 @@ struct Angle {
     }
 };
 
-/// Rates of a triangle's barycentric coordinates along a direction in its plane.
-Vec3 barycentric_rates(const Vec3& e1, const Vec3& e2, const Vec3& direction) {
-    const double g11 = e1.squaredNorm(), g12 = e1.dot(e2), g22 = e2.squaredNorm();
-    const double r1 = e1.dot(direction), r2 = e2.dot(direction);
-    const double determinant = e1.cross(e2).squaredNorm();
-    const double b1 = (g22 * r1 - g12 * r2) / determinant, b2 = (g11 * r2 - g12 * r1) / determinant;
-    return {-b1 - b2, b1, b2};
-}
-
 }  // namespace
-
-ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, const Surface& cloth, bool of_a) {
-    ClothSide side;
-    const ClosestPoints& points = geometry.closest;
-    const Vec3& point = of_a ? points.point_a : points.point_b;
-    const std::array<int, 3> v = feature_vertices(*cloth.mesh, contact, of_a);
-    if (v[1] < 0) {
-        side.weights[0] = 1.0;
-        return side;
-    }
-    // A segment: the edge, or the side of the triangle that is nearest. The code says which (see geometry/distance).
-    int i = 0, j = 1, code;
-    if (v[2] < 0) {
-        code = static_cast<int>(of_a ? points.feature_code / 3 : points.feature_code % 3);
-        side.edge_length = (cloth.vertex(v[1]) - cloth.vertex(v[0])).norm();
-    } else if (points.feature_code != 0) {
-        i = static_cast<int>(points.feature_code - 1) / 3;
-        j = (i + 1) % 3;
-        code = static_cast<int>(points.feature_code - 1) % 3;
-    } else {
-        const Vec3 x0 = cloth.vertex(v[0]), e1 = cloth.vertex(v[1]) - x0, e2 = cloth.vertex(v[2]) - x0;
-        side.weights = Vec3::UnitX() + barycentric_rates(e1, e2, point - x0);
-        const std::array<Vec3, 2> slides = slide_directions(geometry, of_a);
-        for (int k = 0; k < 2; ++k) side.slide[k] = barycentric_rates(e1, e2, slides[k]);
-        return side;
-    }
-    if (code != 2) {
-        side.weights[code == 0 ? i : j] = 1.0;
-        return side;
-    }
-    const Vec3 x0 = cloth.vertex(v[i]), edge = cloth.vertex(v[j]) - x0;
-    const double length = edge.norm();
-    side.weights[j] = (point - x0).dot(edge) / (length * length);
-    side.weights[i] = 1.0 - side.weights[j];
-    side.slide[0][i] = -1.0 / length;
-    side.slide[0][j] = 1.0 / length;
-    return side;
-}
 
 template <class A, class B>
 Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, const A& a, const B& b) {
     return relative_row(
-        motion_of(a, geometry.closest.point_a), motion_of(b, geometry.closest.point_b), geometry.normal);
+        motion_of(a, geometry.closest.a.point), motion_of(b, geometry.closest.b.point), geometry.normal);
 }
 
-double contact_energy(const ContactGeometry& geometry, const ContactRange& range, double stiffness) {
-    const double compression = range.rest - geometry.distance;
-    if (!(compression > 0.0)) return 0.0;
-    const double energy = contact_potential(compression, range.rest - range.pole, stiffness).energy;
+double contact_energy(const ContactGeometry& geometry, const ContactLaw& law) {
+    if (!(law.range.rest - geometry.distance > 0.0)) return 0.0;
+    const double energy = normal_force(law, geometry.distance).energy;
     if (geometry.sine_sq >= kParallelLimit) return energy;
     // Exactly parallel edges have no energy however close they are: vertex-patch pairs hold them apart.
     return geometry.sine_sq > 0.0 ? edge_mollifier(geometry.sine_sq).value * energy : 0.0;
@@ -317,13 +150,12 @@ namespace {
 /// The second derivative is added to `hessian`, unless that is null.
 template <class A, class B>
 ContactForce<A::kSize + B::kSize> derivatives_along(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
-    bool with_curvature, HalfSymmetric<A::kSize + B::kSize>* hessian) {
+    const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b, bool with_curvature,
+    HalfSymmetric<A::kSize + B::kSize>* hessian) {
     constexpr int kSize = A::kSize + B::kSize;
     ContactForce<kSize> result;
     result.row = relative_row(a, b, geometry.normal);
-    const PotentialValue potential =
-        contact_potential(range.rest - geometry.distance, range.rest - range.pole, stiffness);
+    const PotentialValue potential = normal_force(law, geometry.distance);
     const bool mollified = geometry.sine_sq < kParallelLimit;
     const Mollifier mollifier = mollified ? edge_mollifier(geometry.sine_sq) : Mollifier{1.0, 0.0, 0.0};
     result.force = mollifier.value * potential.force;
@@ -334,7 +166,7 @@ ContactForce<A::kSize + B::kSize> derivatives_along(
         if (with_curvature && result.force != 0.0) add_distance_hessian(geometry, a, b, -result.force, *hessian);
     }
     // An edge that has collapsed has no angle.
-    const double shorter_sq = std::min(geometry.closest.edge_a.squaredNorm(), geometry.closest.edge_b.squaredNorm());
+    const double shorter_sq = std::min(geometry.closest.a.edge.squaredNorm(), geometry.closest.b.edge.squaredNorm());
     if (!mollified || shorter_sq == 0.0) return result;
     // Mollifier mu(c), c = 1 - g², times potential: along dg, mu' = -2 g mu'(c) and mu'' = 4 g² mu''(c) - 2 mu'(c).
     const Angle<A, B> angle(geometry, a, b);
@@ -371,17 +203,17 @@ constexpr std::array<double, 4> kRelativeSign = {1.0, -1.0, 1.0, 1.0};
 }  // namespace
 
 ContactForce<9> add_relative_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
-    bool with_curvature, HalfSymmetric<9>* hessian) {
+    const ContactGeometry& geometry, const ContactLaw& law, const BodySide& a, const BodySide& b, bool with_curvature,
+    HalfSymmetric<9>* hessian) {
     return derivatives_along(
-        geometry, range, stiffness, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b),
-        with_curvature, hessian);
+        geometry, law, TurnMotion(a, geometry.closest.a.point), BodyMotion(b, geometry.closest.b.point), with_curvature,
+        hessian);
 }
 
 ContactForce<9> add_relative_curvature(
     const ContactGeometry& geometry, double force, const BodySide& a, const BodySide& b, HalfSymmetric<9>& hessian) {
     return curvature_along(
-        geometry, force, TurnMotion(a, geometry.closest.point_a), BodyMotion(b, geometry.closest.point_b), hessian);
+        geometry, force, TurnMotion(a, geometry.closest.a.point), BodyMotion(b, geometry.closest.b.point), hessian);
 }
 
 template <class A, class B>
@@ -390,7 +222,7 @@ ContactDerivatives<A::kSize + B::kSize> contact_curvature(
     HalfSymmetric<A::kSize + B::kSize> hessian;
     ContactDerivatives<A::kSize + B::kSize> result;
     static_cast<ContactForce<A::kSize + B::kSize>&>(result) = curvature_along(
-        geometry, force, motion_of(side_a, geometry.closest.point_a), motion_of(side_b, geometry.closest.point_b),
+        geometry, force, motion_of(side_a, geometry.closest.a.point), motion_of(side_b, geometry.closest.b.point),
         hessian);
     result.hessian = hessian.whole();
     return result;
@@ -413,13 +245,13 @@ Square<12> both_twists(const Square<9>& relative) {
 
 template <class A, class B>
 ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& side_a, const B& side_b,
-    bool with_hessian, bool with_curvature) {
+    const ContactGeometry& geometry, const ContactLaw& law, const A& side_a, const B& side_b, bool with_hessian,
+    bool with_curvature) {
     ContactDerivatives<A::kSize + B::kSize> result;
     if constexpr (std::is_same_v<A, BodySide> && std::is_same_v<B, BodySide>) {
         HalfSymmetric<9> hessian;
-        const ContactForce<9> relative = add_relative_derivatives(
-            geometry, range, stiffness, side_a, side_b, with_curvature, with_hessian ? &hessian : nullptr);
+        const ContactForce<9> relative =
+            add_relative_derivatives(geometry, law, side_a, side_b, with_curvature, with_hessian ? &hessian : nullptr);
         result.force = relative.force;
         result.stiffness = relative.stiffness;
         result.gradient = both_twists(relative.gradient);
@@ -428,21 +260,21 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     } else {
         HalfSymmetric<A::kSize + B::kSize> hessian;
         static_cast<ContactForce<A::kSize + B::kSize>&>(result) = derivatives_along(
-            geometry, range, stiffness, motion_of(side_a, geometry.closest.point_a),
-            motion_of(side_b, geometry.closest.point_b), with_curvature, with_hessian ? &hessian : nullptr);
+            geometry, law, motion_of(side_a, geometry.closest.a.point), motion_of(side_b, geometry.closest.b.point),
+            with_curvature, with_hessian ? &hessian : nullptr);
         if (with_hessian) result.hessian = hessian.whole();
     }
     return result;
 }
 
-Vec6 GroundContacts::row(const Vec3& arm) {
+Vec6 GroundSums::row(const Vec3& arm) {
     Vec6 row;
     row << arm.y(), -arm.x(), 0.0, 0.0, 0.0, 1.0;
     return row;
 }
 
-PotentialValue GroundContacts::add(double height, const Vec3& arm, const ContactRange& range, double stiffness) {
-    const PotentialValue potential = contact_potential(range.rest - height, range.rest - range.pole, stiffness);
+PotentialValue GroundSums::add(double height, const Vec3& arm, const ContactLaw& law) {
+    const PotentialValue potential = normal_force(law, height);
     m_force += potential.force;
     m_force_arm += potential.force * arm;
     const double k = potential.stiffness, kx = k * arm.x(), ky = k * arm.y();
@@ -455,13 +287,13 @@ PotentialValue GroundContacts::add(double height, const Vec3& arm, const Contact
     return potential;
 }
 
-Vec6 GroundContacts::gradient() const {
+Vec6 GroundSums::gradient() const {
     Vec6 gradient;
     gradient << -m_force_arm.y(), m_force_arm.x(), 0.0, 0.0, 0.0, -m_force;
     return gradient;
 }
 
-Mat6 GroundContacts::hessian(bool with_curvature) const {
+Mat6 GroundSums::hessian(bool with_curvature) const {
     Mat6 hessian = Mat6::Zero();
     const auto set = [&](int i, int j, double value) { hessian(i, j) = hessian(j, i) = value; };
     set(0, 0, m_moments[5]);
@@ -478,7 +310,7 @@ Mat6 GroundContacts::hessian(bool with_curvature) const {
 #define DIFFSIM_INSTANTIATE(A, B)                                                                       \
     template Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry&, const A&, const B&); \
     template ContactDerivatives<A::kSize + B::kSize> contact_derivatives(                               \
-        const ContactGeometry&, const ContactRange&, double, const A&, const B&, bool, bool);
+        const ContactGeometry&, const ContactLaw&, const A&, const B&, bool, bool);
 DIFFSIM_INSTANTIATE(BodySide, BodySide)
 DIFFSIM_INSTANTIATE(BodySide, ClothSide)
 DIFFSIM_INSTANTIATE(ClothSide, ClothSide)

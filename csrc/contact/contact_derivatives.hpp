@@ -1,32 +1,11 @@
 #pragma once
 
-#include "contact/contact.hpp"
+#include "contact/sides.hpp"
 #include "math/half_symmetric.hpp"
 
-/// Derivatives of a contact's energy.
-///
-/// Of a rigid body they are taken along its twist at its current pose, (turn, shift): a turn phi moves
-/// x -> Exp(phi) (x - t) + t about the centre of mass t. Second derivatives are those of this chart at phi = 0, hence
-/// symmetric. Of cloth they are taken along the three nodes of a feature; an edge and a vertex use the first two and
-/// the first.
+/// Derivatives of a contact's energy along the coordinates of its two sides. Second derivatives of a body are those of its
+/// twist's chart at phi = 0, hence symmetric.
 namespace diffsim {
-
-/// A contact on a rigid body.
-struct BodySide {
-    static constexpr int kSize = 6;
-    Vec3 center;  ///< of mass, in the frame of the contact's points
-};
-
-/// A contact on a feature of a cloth.
-struct ClothSide {
-    static constexpr int kSize = 9;
-    Vec3 weights = Vec3::Zero();                               ///< of the nodes in the closest point
-    std::array<Vec3, 2> slide = {Vec3::Zero(), Vec3::Zero()};  ///< their rates when the point slides
-    double edge_length = 0.0;                                  ///< of an edge
-};
-
-/// What a cloth's feature contributes to a contact: where on it the closest point lies.
-ClothSide cloth_side(const Contact& contact, const ContactGeometry& geometry, const Surface& cloth, bool of_a);
 
 /// The energy's first derivative along the coordinates of a and of b, and what it is made of.
 template <int N>
@@ -48,20 +27,20 @@ template <class A, class B>
 Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, const A& a, const B& b);
 
 /// Energy of a contact: mollifier times potential of the compression below the rest distance.
-double contact_energy(const ContactGeometry& geometry, const ContactRange& range, double stiffness);
+double contact_energy(const ContactGeometry& geometry, const ContactLaw& law);
 
 /// `with_curvature` false leaves the second derivative of distance and mollifier out of the Hessian, which is then
 /// stiffness * row rowᵀ. `with_hessian` false leaves the Hessian unset.
 template <class A, class B>
 ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const A& a, const B& b,
-    bool with_hessian, bool with_curvature);
+    const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b, bool with_hessian,
+    bool with_curvature);
 
 /// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. The second derivative is
 /// added to `hessian`, unless that is null.
 ContactForce<9> add_relative_derivatives(
-    const ContactGeometry& geometry, const ContactRange& range, double stiffness, const BodySide& a, const BodySide& b,
-    bool with_curvature, HalfSymmetric<9>* hessian);
+    const ContactGeometry& geometry, const ContactLaw& law, const BodySide& a, const BodySide& b, bool with_curvature,
+    HalfSymmetric<9>* hessian);
 
 /// The same for a contact that pushes with a force of its own, whatever its distance, as a row of a ContactModel does: the second
 /// derivative is -force d²(distance).
@@ -76,12 +55,12 @@ Vector<12> both_twists(const Vector<9>& relative);
 Square<12> both_twists(const Square<9>& relative);
 
 /// The same of a rigid body's vertices above the ground, where they are short: of all its contacts together.
-class GroundContacts {
+class GroundSums {
 public:
     /// Of the height, along the twist, for a vertex with this arm from the centre of mass.
     static Vec6 row(const Vec3& arm);
     /// One more vertex. Returns its energy with respect to its compression.
-    PotentialValue add(double height, const Vec3& arm, const ContactRange& range, double stiffness);
+    PotentialValue add(double height, const Vec3& arm, const ContactLaw& law);
 
     /// One that pushes with a force of its own.
     void add_force(double force, const Vec3& arm) {

@@ -25,7 +25,7 @@ inline PotentialValue contact_potential(double compression, double pole, double 
 
 /// How far the rest distance of a contact with this pole has to be shifted, its pole staying where it is, for this force to
 /// act where the rest distance was.
-double hard_contact_shift(double force, double pole, double stiffness);
+double rest_shift(double force, double pole, double stiffness);
 
 /// Factor on the energy of a pair of edges, a function of the squared sine c of their angle:
 /// mu = 2c/e - (c/e)² below e = kParallelLimit, 1 from there on. Between parallel edges the closest points jump;
@@ -35,29 +35,5 @@ struct Mollifier {
 };
 inline constexpr double kParallelLimit = 1e-3;
 Mollifier edge_mollifier(double sine_sq);
-
-/// Stiffness k of a contact between bodies of these masses; a body that does not yield has infinite mass. It
-/// depends on masses alone, so that it need not be differentiated with respect to the geometry:
-/// k = reduced mass / compliance, times mass ratio / 100 where that is above 1: a light body under a heavy one
-/// carries many times its own weight.
-struct ContactStiffness {
-    double value;
-    double log_gradient_a, log_gradient_b;  ///< d(log k)/d(mass) [1/kg]
-};
-ContactStiffness contact_stiffness(double mass_a, double mass_b, double compliance);
-
-/// The distances at which things happen between two surfaces with this sum of margins.
-struct ContactRange {
-    double rest;     ///< contact pushes below this [m]
-    double landing;  ///< where last step's motion is stopped: inside the contact's reach, far from its pole [m]
-    double floor;    ///< motions are stopped here [m]
-    double pole;     ///< the energy is infinite here [m]
-    double limit;    ///< objects this near penetrate [m]
-};
-ContactRange contact_range(double margin_sum, double thickness);
-
-/// The range of a contact that starts its step at this distance. A step that did not converge may leave objects next to
-/// their pole; theirs moves half way towards the limit, so that the next step can push them out.
-ContactRange rescued_range(const ContactRange& range, double start_distance);
 
 }  // namespace diffsim

@@ -51,7 +51,7 @@ Vec3 polygon_normal(const Vec3* vertices, int count) {
 
 ClosestPoints closest_vertex_polygon(const Vec3& x, const PolygonView& polygon) {
     ClosestPoints result;
-    result.point_a = x;
+    result.a.point = x;
     bool inside = !polygon.normal.isZero(0.0);
     const bool has_area = inside;
     int borders = 0;  // that x is above
@@ -67,9 +67,9 @@ ClosestPoints closest_vertex_polygon(const Vec3& x, const PolygonView& polygon) 
         OnSegment at = nearest_on_segment(x, p0, direction, length_sq);
         if (inward >= -kBorder * length_sq) {
             const bool is_new =
-                borders == 0 || !(is_straight(result.edge_b, direction) || is_straight(direction, result.edge_b));
+                borders == 0 || !(is_straight(result.b.edge, direction) || is_straight(direction, result.b.edge));
             if (!inside || !at.slides || !is_new) continue;
-            result.edge_b = direction;
+            result.b.edge = direction;
             ++borders;
             continue;
         }
@@ -80,24 +80,25 @@ ClosestPoints closest_vertex_polygon(const Vec3& x, const PolygonView& polygon) 
         const Vec3 point = at.parameter < 1.0 ? Vec3(p0 + at.parameter * direction) : p1;
         const double distance_sq = (x - point).squaredNorm();
         // A corner may be as near as the end of one of its edges that the point could slide along.
-        if (distance_sq < best_sq || (distance_sq == best_sq && at.is_border && result.border_count_b == 0)) {
+        if (distance_sq < best_sq || (distance_sq == best_sq && at.is_border && result.b.border_count == 0)) {
             best_sq = distance_sq;
-            result.point_b = point;
-            result.slide_count_b = at.slides ? 1 : 0;
-            result.border_count_b = at.is_border ? 1 : 0;
-            result.edge_b = direction;
+            result.b.point = point;
+            result.b.slide_count = at.slides ? 1 : 0;
+            result.b.border_count = at.is_border ? 1 : 0;
+            result.b.edge = direction;
             // A corner is where its edge begins, whichever of its two edges came first by rounding.
             const bool at_end = at.code() == 1u;
-            result.feature_code = 1u + 3u * static_cast<std::uint32_t>(at_end ? next : k) + (at_end ? 0u : at.code());
+            result.b.code = 1u + 3u * static_cast<std::uint32_t>(at_end ? next : k) + (at_end ? 0u : at.code());
         }
     }
     if (inside) {
         const Vec3& n = polygon.normal;
-        result.point_b = x - n * n.dot(x - polygon.vertices[0]);
-        result.slide_count_b = 2;
-        result.border_count_b = std::min(borders, 2);
-        result.feature_code = 0;
+        result.b.point = x - n * n.dot(x - polygon.vertices[0]);
+        result.b.slide_count = 2;
+        result.b.border_count = std::min(borders, 2);
+        result.b.code = 0;
     }
+    result.feature_code = result.b.code;
     return result;
 }
 
@@ -137,15 +138,17 @@ ClosestPoints closest_edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, 
         best_t = nearest_on_segment(a0 + best_s.parameter * da, b0, db, bb);
     }
     ClosestPoints result;
-    result.point_a = a0 + best_s.parameter * da;
-    result.point_b = b0 + best_t.parameter * db;
-    result.slide_count_a = best_s.slides ? 1 : 0;
-    result.slide_count_b = best_t.slides ? 1 : 0;
-    result.border_count_a = best_s.is_border ? 1 : 0;
-    result.border_count_b = best_t.is_border ? 1 : 0;
-    result.edge_a = da;
-    result.edge_b = db;
-    result.feature_code = 3u * best_s.code() + best_t.code();
+    result.a.point = a0 + best_s.parameter * da;
+    result.b.point = b0 + best_t.parameter * db;
+    result.a.slide_count = best_s.slides ? 1 : 0;
+    result.b.slide_count = best_t.slides ? 1 : 0;
+    result.a.border_count = best_s.is_border ? 1 : 0;
+    result.b.border_count = best_t.is_border ? 1 : 0;
+    result.a.edge = da;
+    result.b.edge = db;
+    result.a.code = best_s.code();
+    result.b.code = best_t.code();
+    result.feature_code = 3u * result.a.code + result.b.code;
     return result;
 }
 

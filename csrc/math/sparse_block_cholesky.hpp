@@ -44,8 +44,6 @@ public:
     void half_solve(const std::vector<int>& blocks, const double* values, HalfSolution& result) const;
 
     int rows() const { return m_row_count; }
-    /// Numbers in the factor, with its padding: a measure of the work of solve_in_place().
-    std::size_t factor_size() const { return m_factor_size; }
 
 private:
     /// Storage that grows and never shrinks; its content does not survive growing.

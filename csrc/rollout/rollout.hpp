@@ -4,6 +4,7 @@
 #include <optional>
 #include <string>
 
+#include "step/contact_readout.hpp"
 #include "step/step.hpp"
 
 /// Many steps of many scenes: the arrays of the Python layer in, the same out.
@@ -113,5 +114,8 @@ std::optional<GradientFault> find_gradient_fault(
 
 /// The linear systems of adjoint modes dense and qr in the last step of a scene. `inputs` are those of the forward.
 std::vector<LinearisedZone> linearised_zones(const Tape& tape, const RolloutInputs& inputs, int scene);
+
+/// What pushed in the last step of a scene. `inputs` are those of the forward.
+std::vector<ContactReadout> last_contacts(const Tape& tape, const RolloutInputs& inputs, int scene);
 
 }  // namespace diffsim

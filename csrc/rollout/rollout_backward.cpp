@@ -4,6 +4,7 @@
 #include "math/rotation.hpp"
 #include "rollout/inputs.hpp"
 #include "rollout/scenes.hpp"
+#include "step/body_step.hpp"
 
 namespace diffsim {
 namespace {
@@ -43,10 +44,7 @@ SceneState end_state(const StepRecord& record) {
     SceneState end = record.start;
     if (record.held) return end;
     for (std::size_t i = 0; i < end.bodies.size(); ++i) {
-        const Vec3 turn = record.y.bodies[i].head<3>();
-        if (turn.isZero(0.0)) continue;
-        end.bodies[i].orientation = quaternion_multiply(exp_quaternion(turn), end.bodies[i].orientation);
-        end.bodies[i].orientation /= end.bodies[i].orientation.norm();
+        end.bodies[i].orientation = turned(end.bodies[i].orientation, record.y.bodies[i].head<3>());
     }
     return end;
 }
@@ -316,13 +314,27 @@ void rollout_backward(
     for (int scene = 0; scene < tape.shape.batch; ++scene) write_gradient(tape, inputs, gradient, scene, scenes[scene]);
 }
 
-std::vector<LinearisedZone> linearised_zones(const Tape& tape, const RolloutInputs& inputs, int scene) {
+namespace {
+
+/// Call visit(model, options, parameters, control, record) for the last step of a scene.
+template <class Visit>
+auto with_last_step(const Tape& tape, const RolloutInputs& inputs, int scene, const Visit& visit) {
     const Model& model = *tape.model;
     const StepRecord& record = tape.records[scene].back();
     Workers workers(1);
     SceneControl control;
     read_control(model, inputs, tape.shape.steps - 1, scene, record.start, workers, control);
-    return linearised_zones(model, tape.options, read_parameters(model, inputs, scene), control, record);
+    return visit(model, tape.options, read_parameters(model, inputs, scene), control, record);
+}
+
+}  // namespace
+
+std::vector<LinearisedZone> linearised_zones(const Tape& tape, const RolloutInputs& inputs, int scene) {
+    return with_last_step(tape, inputs, scene, [](auto&&... step) { return linearised_zones(step...); });
+}
+
+std::vector<ContactReadout> last_contacts(const Tape& tape, const RolloutInputs& inputs, int scene) {
+    return with_last_step(tape, inputs, scene, [](auto&&... step) { return read_contacts(step...); });
 }
 
 }  // namespace diffsim

@@ -4,6 +4,7 @@
 
 #include "dynamics/cloth_elasticity.hpp"
 
+/// How much negative curvature a matrix of a zone loses before it is factorized.
 namespace diffsim {
 
 /// How much of the negative curvature of cloth to cut off: no more than needed, since it is what a sheet follows when it

@@ -48,8 +48,8 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
     });
     for (const Impact& impact : impacts) {
         const ZoneContact& contact = zone.contacts[impact.contact];
-        if (contact.contact.with_ground()) continue;                 // there is no way around a half-space
-        if (contact.cloth_a >= 0 || contact.cloth_b >= 0) continue;  // cloth is led around things, and gives way
+        if (contact.contact.with_ground()) continue;  // there is no way around a half-space
+        if (contact.has_cloth()) continue;            // cloth is led around things, and gives way
         const int a = contact.a, b = contact.b;
         const auto same = [&](const ImpactGate& gate) { return gate.a == a && gate.b == b; };
         if (std::any_of(gates.begin(), gates.end(), same)) continue;
@@ -66,11 +66,11 @@ std::vector<ImpactGate> find_impact_gates(const Zone& zone, const ZonePoint& poi
         ImpactGate gate;
         gate.a = a;
         gate.b = b;
-        gate.point_a = in_body(zone, a, y_a, geometry.closest.point_a);
-        gate.point_b = in_body(zone, b, y_b, geometry.closest.point_b);
+        gate.point_a = in_body(zone, a, y_a, geometry.closest.a.point);
+        gate.point_b = in_body(zone, b, y_b, geometry.closest.b.point);
         gate.normal = geometry.normal;
         const Passage start = passage(gate, zone, point.y);
-        gate.least_points = std::min(start.points, contact.range.rest) - passing;
+        gate.least_points = std::min(start.points, contact.law.range.rest) - passing;
         gate.least_centers = std::min(start.centers, geometry.normal.dot(pose_a.t - pose_b.t)) - 2.0 * passing;
         gate.fast = travel > kFastPart * radius;
         gates.push_back(gate);

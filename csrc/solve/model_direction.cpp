@@ -5,8 +5,9 @@
 #include <cmath>
 #include <tuple>
 
-#include "zone/contact_assembly.hpp"
+#include "zone/contacts.hpp"
 #include "zone/motion_bounds.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
@@ -29,7 +30,7 @@ bool before(const Contact& c, const Contact& d) {
 
 }  // namespace
 
-ModelDirection::ModelDirection(Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system)
+ModelDirection::ModelDirection(const Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system)
     : m_zone(zone), m_path(path), m_point(point), m_system(system) {}
 
 // --- forces, across lists of contacts ---------------------------------------------------------------------------------
@@ -52,9 +53,7 @@ void ModelDirection::start_from(const ZonePoint& point) {
     m_kept.clear();
     for (const ActiveContact& active : point.active) {
         const ZoneContact& contact = m_zone.contacts[active.index];
-        const double pole = contact.range.rest - contact.range.pole;
-        const double push =
-            contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
+        const double push = normal_force(contact.law, active.geometry.distance).force;
         const double force = edge_mollifier(active.geometry.sine_sq).value * push;
         if (force > 0.0) m_kept.emplace_back(contact.contact, force);
     }
@@ -90,7 +89,7 @@ void ModelDirection::list_near() {
             add_near(index, active->geometry);
             continue;
         }
-        if (m_forces[k] == 0.0 && m_point.distances[k] - motion.approach(contact) > contact.range.rest) continue;
+        if (m_forces[k] == 0.0 && m_point.distances[k] - motion.approach(contact) > contact.law.range.rest) continue;
         add_near(index);
     }
 }
@@ -104,11 +103,9 @@ void ModelDirection::add_near(int index) {
 void ModelDirection::add_near(int index, const ContactGeometry& geometry) {
     if (geometry.sine_sq == 0.0) return;  // parallel edges push nothing
     const ZoneContact& contact = m_zone.contacts[index];
-    double stiffness = contact.stiffness.value;
-    const double compression = contact.range.rest - geometry.distance;
-    if (compression > 0.0)
-        stiffness =
-            contact_potential(compression, contact.range.rest - contact.range.pole, stiffness).force / compression;
+    double stiffness = contact.law.stiffness.value;
+    const double compression = contact.law.range.rest - geometry.distance;
+    if (compression > 0.0) stiffness = normal_force(contact.law, geometry.distance).force / compression;
     m_near.push_back({index, geometry, edge_mollifier(geometry.sine_sq).value * stiffness});
 }
 
@@ -173,12 +170,12 @@ void ModelDirection::make_model() {
 
 void ModelDirection::make_start_row(const NearContact& near) {
     const ZoneContact& contact = m_zone.contacts[near.contact];
-    ContactRow row = make_row(m_zone, contact, near.geometry, m_at, m_point.y, contact.range.rest);
+    ContactRow row = make_row(m_zone, contact, near.geometry, m_at, m_point.y, contact.law.range.rest);
     row.contact = near.contact;
-    row.range = contact.range.rest - contact.range.floor;
+    row.range = contact.law.range.rest - contact.law.range.floor;
     row.stiffness = near.stiffness;
     row.force = m_forces[near.contact];
-    const double compression = contact.range.rest - near.geometry.distance;
+    const double compression = contact.law.range.rest - near.geometry.distance;
     if (compression > 0.0) diffsim::add_row(row, row.stiffness * compression, m_model.gradient);
     m_model.rows.push_back(std::move(row));
 }
@@ -209,7 +206,7 @@ bool ModelDirection::add_missed(const Coordinates& y_end) {
         while (near < known && m_near[near].contact < static_cast<int>(k)) ++near;
         if (near < known && m_near[near].contact == static_cast<int>(k)) continue;
         const ZoneContact& contact = m_zone.contacts[k];
-        if (m_point.distances[k] - motion.approach(contact) <= contact.range.rest) add_near(static_cast<int>(k));
+        if (m_point.distances[k] - motion.approach(contact) <= contact.law.range.rest) add_near(static_cast<int>(k));
     }
     if (m_near.size() == known) return false;
     sort_near();
@@ -291,9 +288,9 @@ void ModelDirection::linearise_at(const Coordinates& y_end, const std::vector<Im
 
 void ModelDirection::add_row(const NearContact& near, const ContactGeometry& geometry) {
     const ZoneContact& contact = m_zone.contacts[near.contact];
-    ContactRow row = make_row(m_zone, contact, geometry, m_at, m_point.y, contact.range.rest);
+    ContactRow row = make_row(m_zone, contact, geometry, m_at, m_point.y, contact.law.range.rest);
     row.contact = near.contact;
-    row.range = contact.range.rest - contact.range.floor;
+    row.range = contact.law.range.rest - contact.law.range.floor;
     row.stiffness = near.stiffness;
     row.force = m_row_force[near.contact];
     m_model.rows.push_back(std::move(row));
@@ -323,15 +320,7 @@ void ModelDirection::shorten_blocked(const std::vector<Impact>& impacts, Coordin
     std::vector<char> body(m_zone.bodies.size(), 0), node(m_zone.nodes.size(), 0);
     for (const Impact& impact : impacts) {
         const ZoneContact& contact = m_zone.contacts[impact.contact];
-        for (bool of_a : {true, false}) {
-            if (!of_a && contact.contact.with_ground()) continue;
-            if ((of_a ? contact.cloth_a : contact.cloth_b) >= 0) {
-                for (int n : feature_nodes(m_zone, contact, of_a))
-                    if (n >= 0) node[n] = 1;
-            } else {
-                body[of_a ? contact.a : contact.b] = 1;
-            }
-        }
+        visit_movers(m_zone, contact, [&](int i) { body[i] = 1; }, [&](int i) { node[i] = 1; });
     }
     for (std::size_t i = 0; i < p.bodies.size(); ++i)
         if (body[i]) p.bodies[i] *= 0.5;
@@ -461,8 +450,7 @@ void ModelDirection::damp(const ZonePoint& trial, double rise) {
         const ActiveContact& active = trial.active[k];
         const ZoneContact& contact = m_zone.contacts[active.index];
         const double force = m_forces[active.index];
-        excess[k] = contact_energy(active.geometry, contact.range, contact.stiffness.value) -
-                    0.5 * force * force / contact.stiffness.value;
+        excess[k] = contact_energy(active.geometry, contact.law) - 0.5 * force * force / contact.law.stiffness.value;
         largest = std::max(largest, excess[k]);
         sum += std::max(excess[k], 0.0);
     }
@@ -471,15 +459,12 @@ void ModelDirection::damp(const ZonePoint& trial, double rise) {
     for (std::size_t k = 0; k < trial.active.size(); ++k) {
         if (!(excess[k] > kExcess * largest)) continue;
         const ZoneContact& contact = m_zone.contacts[trial.active[k].index];
-        for (bool of_a : {true, false}) {
-            if (!of_a && contact.contact.with_ground()) continue;
-            if ((of_a ? contact.cloth_a : contact.cloth_b) >= 0) {
-                for (int n : feature_nodes(m_zone, contact, of_a))
-                    if (n >= 0) marked[static_cast<std::size_t>(m_zone.dynamic_count + n)] = 1;
-            } else if (m_zone.yields(of_a ? contact.a : contact.b)) {
-                marked[of_a ? contact.a : contact.b] = 1;
-            }
-        }
+        visit_movers(
+            m_zone, contact,
+            [&](int body) {
+                if (m_zone.yields(body)) marked[body] = 1;
+            },
+            [&](int node) { marked[static_cast<std::size_t>(m_zone.dynamic_count + node)] = 1; });
     }
     for (std::size_t i = 0; i < m_weight.size(); ++i)
         if (marked[i]) m_weight[i] = std::max(kProximal, kMoreProximal * m_weight[i]);

@@ -4,6 +4,7 @@
 #include "solve/cut_search.hpp"
 #include "solve/zone_path.hpp"
 
+/// The direction of a zone far from its solution.
 namespace diffsim {
 
 /// The direction of a zone far from its solution: the minimiser of one convex model of all near contacts, linearised again
@@ -14,7 +15,7 @@ namespace diffsim {
 class ModelDirection {
 public:
     /// All of them are used for as long as this lives.
-    ModelDirection(Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system);
+    ModelDirection(const Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system);
 
     /// Begin with the forces at a point: those of the last step, where that is the start of this one.
     void start_from(const ZonePoint& point);
@@ -64,7 +65,7 @@ private:
     void linearise_at(const Coordinates& y_end, const std::vector<Impact>& impacts);
     void shorten_blocked(const std::vector<Impact>& impacts, Coordinates& p) const;
 
-    Zone& m_zone;
+    const Zone& m_zone;
     ZonePath& m_path;
     ZonePoint& m_point;
     BlockSystem& m_system;

@@ -3,8 +3,9 @@
 #include <memory>
 
 #include "solve/cut_search.hpp"
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
+/// The direction of a zone near its solution.
 namespace diffsim {
 
 /// Newton steps of a zone, one after the other, and the factor that the last of them came from.

@@ -2,6 +2,7 @@
 
 #include "zone/zone_contacts.hpp"
 
+/// Moving apart what a state has too near to each other.
 namespace diffsim {
 
 struct Separation {

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "zone/contact_memory.hpp"
+
 namespace diffsim {
 namespace {
 
@@ -13,15 +15,11 @@ constexpr double kArcPart = 0.9;              // of an arc whose chord is not cl
 }  // namespace
 
 ZonePath::ZonePath(
-    Zone& zone, const PassiveBodies& passive, const HardContacts& hard, ZonePoint& point, ZonePoint& trial,
-    ContactCoverage& coverage, BlockSystem& system)
-    : m_zone(zone),
-      m_passive(passive),
-      m_hard(hard),
-      m_point(point),
-      m_trial(trial),
-      m_coverage(coverage),
-      m_system(system) {}
+    Zone& zone, const PassiveBodies& passive, ZonePoint& point, ZonePoint& trial, ContactCoverage& coverage,
+    BlockSystem& system)
+    : m_zone(zone), m_passive(passive), m_point(point), m_trial(trial), m_coverage(coverage), m_system(system) {
+    forget_contacts(zone);
+}
 
 void ZonePath::set_to_targets(Coordinates& y_end) const {
     for (std::size_t i = 0; i < y_end.bodies.size(); ++i) y_end.bodies[i] = m_zone.bodies[i].target;
@@ -30,8 +28,7 @@ void ZonePath::set_to_targets(Coordinates& y_end) const {
 
 void ZonePath::list_contacts(Coordinates& y_end) {
     collect_contacts(m_zone, m_passive, m_point.y, y_end, m_coverage);
-    if (m_rescue) rescue_contacts(m_zone);
-    m_hard.restore(m_zone);
+    recall_contacts(m_zone);
     m_position = m_zone.model->thickness;
     if (m_zone.model->ground.present) m_position = std::max(m_position, std::abs(m_zone.ground_height));
     for (int i = 0; i < m_zone.body_count(); ++i) {
@@ -51,8 +48,12 @@ bool ZonePath::ensure_covered(Coordinates& y_end) {
 }
 
 void ZonePath::rescue() {
-    m_rescue = true;
     rescue_contacts(m_zone);
+    evaluate(m_zone, m_point);
+}
+
+void ZonePath::shift_contacts(double stiffening) {
+    diffsim::shift_contacts(m_zone, m_point, stiffening);
     evaluate(m_zone, m_point);
 }
 
@@ -68,7 +69,7 @@ bool ZonePath::is_fast(int body) const {
 }
 
 bool ZonePath::is_fast(const ZoneContact& contact) const {
-    if (contact.contact.with_ground() || contact.cloth_a >= 0 || contact.cloth_b >= 0) return false;
+    if (contact.contact.with_ground() || contact.has_cloth()) return false;
     return std::any_of(m_gates.begin(), m_gates.end(), [&](const ImpactGate& gate) {
         return gate.fast && gate.a == contact.a && gate.b == contact.b;
     });

@@ -2,21 +2,21 @@
 
 #include <vector>
 
-#include "solve/hard_contacts.hpp"
 #include "solve/impact_gate.hpp"
 #include "zone/zone_contacts.hpp"
 
+/// Ways of a zone, and the contacts that are listed for them.
 namespace diffsim {
 
 /// Where a zone may go from its current point: the list of its contacts is made complete for the ways that are asked about,
 /// and these end before impacts and gates. Trials are points on such ways.
 class ZonePath {
 public:
-    /// All of them are used, and `point`, `trial` and `coverage` changed, for as long as this lives. `system` gets the
+    /// The zone begins without contacts. All of them are used, and the zone's contacts, `point`, `trial` and `coverage` changed, for as long as this lives. `system` gets the
     /// pattern of the contacts.
     ZonePath(
-        Zone& zone, const PassiveBodies& passive, const HardContacts& hard, ZonePoint& point, ZonePoint& trial,
-        ContactCoverage& coverage, BlockSystem& system);
+        Zone& zone, const PassiveBodies& passive, ZonePoint& point, ZonePoint& trial, ContactCoverage& coverage,
+        BlockSystem& system);
 
     /// Size of the numbers that distances are differences of [m].
     double position() const { return m_position; }
@@ -34,6 +34,8 @@ public:
     bool covers(const Coordinates& y_end) const { return is_covered(m_zone, m_coverage, y_end); }
     /// Some objects start the step below their floor: widen the range of their contacts, here and in all lists to come.
     void rescue();
+    /// Let the forces of exact contacts act at their rest distances; see diffsim::shift_contacts.
+    void shift_contacts(double stiffening);
 
     // --- gates
 
@@ -59,14 +61,12 @@ public:
 private:
     Zone& m_zone;
     const PassiveBodies& m_passive;
-    const HardContacts& m_hard;
     ZonePoint &m_point, &m_trial;
     ContactCoverage& m_coverage;
     BlockSystem& m_system;
     std::vector<ImpactGate> m_gates;
     double m_position = 0.0;
     int m_list_number = 0;
-    bool m_rescue = false;
 };
 
 }  // namespace diffsim

@@ -6,8 +6,8 @@
 #include <utility>
 
 #include "parallel/interrupt.hpp"
-#include "solve/hard_contacts.hpp"
 #include "solve/model_direction.hpp"
+#include "solve/multiplier_rounds.hpp"
 #include "solve/newton_direction.hpp"
 #include "solve/zone_path.hpp"
 #include "zone/zone_accuracy.hpp"
@@ -17,10 +17,10 @@ namespace {
 
 constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
-constexpr int kMaxStalls = 3;            // steps in a row that get a driven body nowhere
-constexpr double kStall = 1e-3;          // of the way that is left
-constexpr double kHardTolerance = 1e-9;  // on a hard contact's distance, of its range
-constexpr int kMaxHardRounds = 50;
+constexpr int kMaxStalls = 3;             // steps in a row that get a driven body nowhere
+constexpr double kStall = 1e-3;           // of the way that is left
+constexpr double kExactTolerance = 1e-9;  // on an exact contact's distance, of its range
+constexpr int kMaxMultiplierRounds = 50;
 constexpr double kNearSolution = 1e-4;  // residual below which the plain Newton step ends it
 constexpr int kMaxModelFactors = 1000;  // of a zone with cloth: from there on impacts just stop it
 constexpr double kGoodEnough = 1e3;     // times the tolerance: enough where rounding hides all further descent
@@ -40,7 +40,7 @@ public:
           m_options(options),
           m_w(workspace),
           m_visited(visited),
-          m_path(zone, passive, m_hard, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
+          m_path(zone, passive, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
 
     ZoneResult solve() {
         start();
@@ -53,7 +53,7 @@ public:
         m_near =
             m_zone.dynamic_count == 1 && m_zone.nodes.empty();  // a factor costs hardly more than the gradient alone
         iterate();
-        if (m_zone.hard) harden();
+        if (m_zone.exact_contact) multiplier_rounds();
         return m_result;
     }
 
@@ -65,7 +65,6 @@ private:
 
     void start() {
         const std::size_t count = static_cast<std::size_t>(m_zone.dynamic_count);
-        m_zone.bodies.resize(count);  // those that do not yield join anew
         m_w.point.y.assign_zero(count, m_zone.nodes.size());
         m_w.y_end.resize(count, m_zone.nodes.size());
         set_to_expected_ends(m_w.y_end);
@@ -73,7 +72,7 @@ private:
         evaluate(m_zone, m_w.point);
         bool rescue = false;  // some objects start the step below their floor
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
-            const ContactRange& range = m_zone.contacts[k].range;
+            const ContactRange& range = m_zone.contacts.law(k).range;
             rescue = rescue || m_w.point.distances[k] < range.floor;
             if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
             m_result.status = ZoneStatus::bad_start;
@@ -97,7 +96,8 @@ private:
             const double radius = m_zone.mesh(static_cast<int>(i)).radius;
             const auto extent = [&](const Vec6& y) { return y.tail<3>().norm() + radius * y.head<3>().norm(); };
             const double falling = extent(body.target);
-            if (falling < kShortWay * radius && extent(body.warm) < kHeld * falling) y_end.bodies[i] = body.warm;
+            if (falling < kShortWay * radius && extent(body.last_motion) < kHeld * falling)
+                y_end.bodies[i] = body.last_motion;
         }
     }
 
@@ -135,9 +135,9 @@ private:
     /// Last step's motion already respected last step's contacts: it is the natural first iterate.
     void go_to_warm_start() {
         m_w.y_end = y();
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].warm;
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].last_motion;
         for (int i = 0; i < m_zone.node_count(); ++i)
-            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].warm;
+            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].last_motion;
         if (largest_move() < kEpsilon * m_path.position()) return;
         m_path.ensure_covered(m_w.y_end);
         // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and
@@ -168,10 +168,10 @@ private:
         double& stiffness = m_w.derivatives.largest_stiffness;
         for (std::size_t k = 0; m_w.point.active.empty() && k < m_zone.contacts.size(); ++k) {
             const ZoneContact& contact = m_zone.contacts[k];
-            if (m_w.point.distances[k] > contact.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
+            if (m_w.point.distances[k] > contact.law.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
             for (int body : {contact.a, contact.b})
                 if (m_zone.yields(body))
-                    stiffness = std::max(stiffness, contact.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
+                    stiffness = std::max(stiffness, contact.law.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
         }
         return accuracy(m_zone, m_w.derivatives, m_path.position());
     }
@@ -337,7 +337,7 @@ private:
         set_step_end();
         double range = kInfinity;
         for (const ActiveContact& active : m_w.point.active) {
-            const ContactRange& r = m_zone.contacts[active.index].range;
+            const ContactRange& r = m_zone.contacts.law(active.index).range;
             range = std::min(range, r.rest - r.floor);
         }
         const double scale = range / largest_move();
@@ -426,26 +426,25 @@ private:
         return true;
     }
 
-    /// Rounds of multipliers until hard contacts are at their rest distance.
-    void harden() {
+    /// Rounds of multipliers until exact contacts are at their rest distance.
+    void multiplier_rounds() {
         for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
-            const double violation = HardContacts::violation(m_zone, m_w.point, m_path.position());
-            if (violation <= kHardTolerance) return;
-            if (round >= kMaxHardRounds) return fail(ZoneStatus::too_many_iterations);
-            m_hard.shift(m_zone, m_w.point, violation);
-            evaluate(m_zone, m_w.point);
+            const double violation = MultiplierRounds::violation(m_zone, m_w.point, m_path.position());
+            if (violation <= kExactTolerance) return;
+            if (round >= kMaxMultiplierRounds) return fail(ZoneStatus::too_many_iterations);
+            m_path.shift_contacts(m_rounds.stiffening(m_zone, violation));
             iterate();
         }
     }
 
     void fail(ZoneStatus status) { m_result.status = status; }
 
-    Zone& m_zone;
+    const Zone& m_zone;  // its contacts change by m_path alone
     const ZoneOptions& m_options;
     ZoneWorkspace& m_w;
     std::vector<Box>& m_visited;
-    HardContacts m_hard;
     ZonePath m_path;
+    MultiplierRounds m_rounds;
     std::optional<ModelDirection> m_model;  // made when first asked: most bodies at rest never do
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted

@@ -4,7 +4,9 @@
 #include <vector>
 
 #include "zone/zone_contacts.hpp"
+#include "zone/zone_derivatives.hpp"
 
+/// The minimisation of a zone's energy over one step.
 namespace diffsim {
 
 class Interrupt;
@@ -44,7 +46,6 @@ struct ZoneWorkspace {
     ContactCoverage coverage;
     Coordinates step, y_end;
     std::vector<double> pushed;  ///< sum of the contact forces on each body
-    Box swept;
 };
 
 /// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts after

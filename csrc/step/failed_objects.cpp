@@ -4,6 +4,8 @@
 #include <functional>
 #include <utility>
 
+#include "zone/zone_derivatives.hpp"
+
 namespace diffsim {
 namespace {
 

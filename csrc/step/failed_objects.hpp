@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "zone/zone.hpp"
+#include "zone/zone_point.hpp"
 
 /// Who the failure of a zone is about: objects (Model::name), ascending.
 namespace diffsim {

@@ -6,6 +6,7 @@
 #include "geometry/box_tree.hpp"
 #include "math/union_find.hpp"
 
+/// Which objects are solved together, by the space that they may go through.
 namespace diffsim {
 
 /// Objects to be solved together: their places in ObjectGroups::members().

@@ -3,9 +3,36 @@
 #include <algorithm>
 
 #include "math/rotation.hpp"
+#include "step/body_step.hpp"
+#include "step/cloth_step.hpp"
+#include "zone/contact_memory.hpp"
 #include "zone/zone_contacts.hpp"
 
 namespace diffsim {
+
+namespace {
+
+/// The two bodies of a pair, the smaller index first.
+std::pair<int, int> bodies_of(const ObjectPair& pair) {
+    return {std::min(pair.a.body, pair.b.body), std::max(pair.a.body, pair.b.body)};
+}
+
+/// Give each two bodies that yield and touch a block of the Hessian.
+void number_blocks(Zone& zone) {
+    ContactSet& set = zone.contacts;
+    const auto has_block = [&](const ObjectPair& pair) { return zone.yields(pair.a.body) && zone.yields(pair.b.body); };
+    for (const ObjectPair& pair : set.pairs)
+        if (has_block(pair)) set.blocks.push_back(bodies_of(pair));
+    std::sort(set.blocks.begin(), set.blocks.end());
+    set.blocks.erase(std::unique(set.blocks.begin(), set.blocks.end()), set.blocks.end());
+    for (ObjectPair& pair : set.pairs) {
+        if (!has_block(pair)) continue;
+        const auto block = std::lower_bound(set.blocks.begin(), set.blocks.end(), bodies_of(pair));
+        pair.block = static_cast<int>(block - set.blocks.begin());
+    }
+}
+
+}  // namespace
 
 RecordedZones::Range RecordedZones::end_of(int index) const {
     if (index < 0) return {};
@@ -25,7 +52,7 @@ void RecordedZones::rebuild(int index, ZoneMemory& memory, std::vector<int>& loc
     evaluate(zone, point);
     bool below_floor = false;
     for (std::size_t k = 0; k < zone.contacts.size(); ++k)
-        below_floor = below_floor || point.distances[k] < zone.contacts[k].range.floor;
+        below_floor = below_floor || point.distances[k] < zone.contacts.law(k).range.floor;
     if (below_floor) {
         rescue_contacts(zone);
         evaluate(zone, point);
@@ -40,7 +67,7 @@ void RecordedZones::add_objects(
         first.body < end.body
             ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
             : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
-    start_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
+    make_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
     zone.elastic = !m_options.split;
     memory.workspace.point.y.resize(0, 0);
     for (int b = first.body; b < end.body; ++b) join_body(memory, local, m_record.zones.bodies[b]);
@@ -53,7 +80,8 @@ void RecordedZones::join_body(ZoneMemory& memory, std::vector<int>& local, int i
     ZoneBody body;
     body.id = id;
     if (m_model.bodies[id].is_dynamic())
-        body = moving_body(id, state, m_control.bodies[id], m_parameters, m_record.free_rotation[id], m_options.dt);
+        body = moving_body(
+            {m_model, m_parameters, m_options.dt}, id, state, m_control.bodies[id], m_record.free_rotation[id]);
     else
         body.start = {quaternion_to_matrix(state.orientation), state.position};
     body.start.t -= memory.zone.origin;
@@ -88,26 +116,14 @@ void RecordedZones::list_contacts(
     };
     for (int c = first.contact; c < end.contact; ++c) {
         const Contact& contact = m_record.zones.contacts[c];
-        if (zone.hard) zone.compliance = m_record.zones.hard[c].compliance;
+        if (zone.exact_contact) zone.contacts.memory.compliance = m_record.zones.exact[c].compliance;
         add_contact(zone, contact, object_of(contact.object_a), object_of(contact.object_b));
-        ZoneContact& entry = zone.contacts.back();
-        if (zone.hard) {
-            entry.shift = m_record.zones.hard[c].shift;
-            entry.range.rest += entry.shift;
-        }
-        if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
-        const std::pair<int, int> pair(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
-        if (zone.pairs.empty() || zone.pairs.back() != pair) zone.pairs.push_back(pair);
+        if (!zone.exact_contact) continue;
+        ContactLaw& law = zone.contacts.laws.back();
+        law.shift = m_record.zones.exact[c].shift;
+        law.range.rest += law.shift;
     }
-    std::sort(zone.pairs.begin(), zone.pairs.end());
-    zone.pairs.erase(std::unique(zone.pairs.begin(), zone.pairs.end()), zone.pairs.end());
-    auto pair = zone.pairs.begin();
-    for (ZoneContact& entry : zone.contacts) {
-        if (!zone.yields(entry.a) || !zone.yields(entry.b)) continue;
-        const std::pair<int, int> key(std::min(entry.a, entry.b), std::max(entry.a, entry.b));
-        if (*pair != key) pair = std::lower_bound(zone.pairs.begin(), zone.pairs.end(), key);
-        entry.pair = static_cast<int>(pair - zone.pairs.begin());
-    }
+    number_blocks(zone);
 }
 
 std::vector<LinearisedZone> linearised_zones(

@@ -2,6 +2,7 @@
 
 #include "step/step.hpp"
 
+/// Zones of a recorded step, for its backward.
 namespace diffsim {
 
 /// The zones of a step that was taken, put together again from its record. Keeps references to all it is given.

@@ -8,11 +8,12 @@
 
 #include "adjoint/adjoint.hpp"
 #include "adjoint/linearised_zone.hpp"
+#include "dynamics/free_motion.hpp"
 #include "model/state.hpp"
 #include "parallel/interrupt.hpp"
 #include "parallel/workers.hpp"
 #include "solve/zone_solver.hpp"
-#include "step/step_start.hpp"
+#include "step/step_setting.hpp"
 #include "step/touching_zones.hpp"
 
 /// One time step and its backward: the only place that knows the whole order.
@@ -108,14 +109,6 @@ SceneState step(
 /// What takes the place of a step that cannot be taken because of these objects: the state, unchanged and not converged.
 SceneState hold(
     const SceneState& state, ZoneStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record);
-
-/// d(loss)/d(Parameters).
-struct ParameterGradient {
-    std::vector<double> mass;
-    std::vector<Mat3> inertia;
-    Vec3 gravity = Vec3::Zero();
-    std::vector<ClothParameters> cloths;
-};
 
 /// Carry the gradient at the end of a step back to its start. `gradient` is overwritten; control and parameter
 /// gradients are added to. What `needs` does not ask for is incomplete.

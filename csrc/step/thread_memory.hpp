@@ -5,6 +5,7 @@
 #include "adjoint/adjoint.hpp"
 #include "step/step.hpp"
 
+/// What each thread of a step keeps to itself.
 namespace diffsim {
 
 /// A kinematic body that did not reach its target.
@@ -22,14 +23,14 @@ struct FailedGroup {
 
 /// What one thread collects of the groups it solves.
 struct GroupResults {
-    std::vector<Contact> contacts;  ///< active, group after group
-    std::vector<HardContact> hard;  ///< of theirs, if they are
+    std::vector<Contact> contacts;    ///< active, group after group
+    std::vector<ExactContact> exact;  ///< of theirs, if they are
     std::vector<BlockedDrive> blocked;
     std::vector<FailedGroup> failed;  ///< also of groups that were joined by others and solved again
 
     void clear() {
         contacts.clear();
-        hard.clear();
+        exact.clear();
         blocked.clear();
         failed.clear();
     }

@@ -15,14 +15,14 @@ int to_offsets(std::vector<int>& sizes) {
 }  // namespace
 
 std::size_t TouchingZones::bytes() const {
-    return contacts.capacity() * sizeof(Contact) + hard.capacity() * sizeof(HardContact) +
+    return contacts.capacity() * sizeof(Contact) + exact.capacity() * sizeof(ExactContact) +
            (bodies.capacity() + cloths.capacity() + body_end.capacity() + cloth_end.capacity() +
             contact_end.capacity()) *
                sizeof(int);
 }
 
 void ZoneFinder::find(
-    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_hard,
+    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_exact,
     bool one_zone, TouchingZones& zones) {
     const int object_count = model.body_count() + model.cloth_count();
     const auto yields = [&](int object) {
@@ -30,7 +30,7 @@ void ZoneFinder::find(
     };
     const auto for_each_contact = [&](const auto& visit) {
         for (const ContactList& list : lists)
-            for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list.hard[k]);
+            for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list.exact[k]);
     };
 
     m_touching.reset(object_count);
@@ -42,7 +42,7 @@ void ZoneFinder::find(
             m_touching.unite(movers[0], i);
         }
     }
-    for_each_contact([&](const Contact& c, const HardContact&) {
+    for_each_contact([&](const Contact& c, const ExactContact&) {
         if (yields(c.object_a)) m_zone_of[c.object_a] = 0;
         if (yields(c.object_b)) m_zone_of[c.object_b] = 0;
         if (yields(c.object_a) && yields(c.object_b)) m_touching.unite(c.object_a, c.object_b);
@@ -67,11 +67,11 @@ void ZoneFinder::find(
     const auto zone_of_contact = [&](const Contact& c) {
         return m_zone_of[yields(c.object_a) ? c.object_a : c.object_b];
     };
-    for_each_contact([&](const Contact& c, const HardContact&) { ++zones.contact_end[zone_of_contact(c)]; });
+    for_each_contact([&](const Contact& c, const ExactContact&) { ++zones.contact_end[zone_of_contact(c)]; });
     zones.bodies.resize(static_cast<std::size_t>(to_offsets(zones.body_end)));
     zones.cloths.resize(static_cast<std::size_t>(to_offsets(zones.cloth_end)));
     zones.contacts.resize(static_cast<std::size_t>(to_offsets(zones.contact_end)));
-    zones.hard.resize(with_hard ? zones.contacts.size() : 0);
+    zones.exact.resize(with_exact ? zones.contacts.size() : 0);
     for (int i : movers) {
         if (m_zone_of[i] < 0) continue;
         if (model.is_cloth(i))
@@ -79,10 +79,10 @@ void ZoneFinder::find(
         else
             zones.bodies[zones.body_end[m_zone_of[i]]++] = i;
     }
-    for_each_contact([&](const Contact& c, const HardContact& hard) {
+    for_each_contact([&](const Contact& c, const ExactContact& exact) {
         const int slot = zones.contact_end[zone_of_contact(c)]++;
         zones.contacts[slot] = c;
-        if (with_hard) zones.hard[slot] = hard;
+        if (with_exact) zones.exact[slot] = exact;
     });
 }
 

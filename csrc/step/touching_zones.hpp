@@ -14,7 +14,7 @@ namespace diffsim {
 struct TouchingZones {
     std::vector<int> bodies, cloths;
     std::vector<Contact> contacts;
-    std::vector<HardContact> hard;                      ///< one per contact; empty when contacts give way
+    std::vector<ExactContact> exact;                    ///< one per contact; empty when contacts give way
     std::vector<int> body_end, cloth_end, contact_end;  ///< of each zone in the lists above
 
     int count() const { return static_cast<int>(body_end.size()); }
@@ -24,7 +24,7 @@ struct TouchingZones {
 /// Active contacts of one group.
 struct ContactList {
     const Contact* contacts;
-    const HardContact* hard;
+    const ExactContact* exact;
     int count;
 };
 
@@ -33,7 +33,7 @@ class ZoneFinder {
 public:
     /// `movers` are the dynamic bodies and the cloths, sorted. `one_zone` puts them all into one.
     void find(
-        const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_hard,
+        const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_exact,
         bool one_zone, TouchingZones& zones);
 
 private:

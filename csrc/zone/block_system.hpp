@@ -9,6 +9,7 @@
 #include "math/sparse_block_cholesky.hpp"
 #include "zone/coordinates.hpp"
 
+/// Linear systems on a zone's bodies and nodes.
 namespace diffsim {
 
 using Mat63 = Eigen::Matrix<double, 6, 3>;

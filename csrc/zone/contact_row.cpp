@@ -1,6 +1,9 @@
 #include "zone/contact_row.hpp"
 
+#include <type_traits>
+
 #include "math/rotation.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 
@@ -8,15 +11,16 @@ ContactRow make_row(
     const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const Placement& at,
     const Coordinates& y_now, double wanted) {
     ContactRow row;
-    row.pair = contact.pair;
-    row.stiffness = contact.stiffness.value;
+    row.pair = contact.block;
+    row.stiffness = contact.law.stiffness.value;
     row.missing = wanted - geometry.distance;
     row.relative.tail<3>() = -geometry.normal;
-    const auto add_body = [&](int body, const Vec3& point, const Vec3& normal, int& slot, int turn) {
+    const auto add_body = [&](const SideOfBody& side, const Vec3& point, const Vec3& normal, int& slot, int turn) {
+        const int body = side.body();
         const Vec6& y = at.y.bodies[body];
         Vec6 out;
         out << left_jacobian(y.head<3>()).transpose() * (point - at.poses[body].t).cross(normal), normal;
-        if (zone.yields(body)) {
+        if (side.yields()) {
             row.relative.segment<3>(turn) = out.head<3>();
             slot = body;
             row.missing += out.dot(y - y_now.bodies[body]);
@@ -24,15 +28,13 @@ ContactRow make_row(
             row.missing -= out.dot(zone.bodies[body].target - y);
         }
     };
-    const auto add_cloth = [&](bool of_a, const Vec3& normal) {
-        const Surface surface =
-            of_a ? surface_a(zone, contact, at.poses, at.nodes) : surface_b(zone, contact, at.poses, at.nodes);
-        const Vec3 weights = cloth_side(contact.contact, geometry, surface, of_a).weights;
-        const std::array<int, 3> nodes = feature_nodes(zone, contact, of_a);
+    const auto add_cloth = [&](const SideOfCloth& side, const ClosestPoint& closest, const Vec3& normal) {
+        const PlacedSide<ClothSide> placed = placed_side(side, closest, geometry.normal, at.poses, at.nodes);
         for (int k = 0; k < 3; ++k) {
-            const int node = nodes[static_cast<std::size_t>(k)];
-            if (node < 0 || weights[k] == 0.0) continue;
-            const Vec3 part = weights[k] * normal;
+            const int node = placed.nodes[static_cast<std::size_t>(k)];
+            const double weight = placed.side.weights[k];
+            if (node < 0 || weight == 0.0) continue;
+            const Vec3 part = weight * normal;
             if (zone.nodes[node].pinned) {
                 row.missing -= part.dot(zone.nodes[node].target - at.y.nodes[node]);
                 continue;
@@ -42,15 +44,15 @@ ContactRow make_row(
             row.node_rows.push_back(part);
         }
     };
-    if (contact.cloth_a >= 0)
-        add_cloth(true, geometry.normal);
-    else
-        add_body(contact.a, geometry.closest.point_a, geometry.normal, row.a, 0);
-    if (contact.contact.with_ground()) return row;
-    if (contact.cloth_b >= 0)
-        add_cloth(false, -geometry.normal);
-    else
-        add_body(contact.b, geometry.closest.point_b, -geometry.normal, row.b, 3);
+    const auto add = [&](const auto& side, const ClosestPoint& closest, const Vec3& normal, int& slot, int turn) {
+        using Side = std::decay_t<decltype(side)>;
+        if constexpr (std::is_same_v<Side, SideOfBody>) add_body(side, closest.point, normal, slot, turn);
+        if constexpr (std::is_same_v<Side, SideOfCloth>) add_cloth(side, closest, normal);
+    };
+    with_sides(zone, contact, [&](const auto& a, const auto& b) {
+        add(a, geometry.closest.a, geometry.normal, row.a, 0);
+        add(b, geometry.closest.b, -geometry.normal, row.b, 3);
+    });
     return row;
 }
 

@@ -1,8 +1,9 @@
 #pragma once
 
 #include "contact/contact_derivatives.hpp"
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
+/// Contacts as linear rows over the coordinates of a zone: J x and Jᵀ f.
 namespace diffsim {
 
 /// A linearised contact: gap + rowᵀ p should reach a distance. Half-spaces with a penalty, see ContactModel.

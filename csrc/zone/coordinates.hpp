@@ -4,6 +4,7 @@
 
 #include "math/types.hpp"
 
+/// The unknowns of a step.
 namespace diffsim {
 
 /// Generalized coordinates of a step, or anything with one entry per coordinate: (theta, u) of each body, u of each

@@ -8,6 +8,11 @@ double motion_bound(const Vec6& change, double radius) {
     return change.tail<3>().norm() + std::min(change.head<3>().norm(), 2.0) * radius;
 }
 
+double sagitta(const Vec6& change, double radius) {
+    const double angle = change.head<3>().norm();
+    return radius * std::min(0.125 * angle * angle, 2.0);
+}
+
 Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end) {
     Vec3 sum = Vec3::Zero();
     for (int i = cloth.first_node; i < cloth.first_node + count; ++i) sum += end.nodes[i] - begin.nodes[i];
@@ -33,13 +38,15 @@ double MotionBounds::body(int index) const {
 
 double MotionBounds::approach_of_cloth(const ZoneContact& contact) const {
     const bool self = contact.contact.object_a == contact.contact.object_b;
-    return of(contact, true, self) + (contact.contact.with_ground() ? 0.0 : of(contact, false, self));
+    return with_sides(
+        m_zone, contact, [&](const auto& a, const auto& b) -> double { return of(a, self) + of(b, self); });
 }
 
-double MotionBounds::of(const ZoneContact& contact, bool of_a, bool self) const {
-    if ((of_a ? contact.cloth_a : contact.cloth_b) < 0) return body(of_a ? contact.a : contact.b);
+double MotionBounds::of(const SideOfBody& side, bool) const { return body(side.body()); }
+
+double MotionBounds::of(const SideOfCloth& side, bool self) const {
     double bound = 0.0;
-    for (int node : feature_nodes(m_zone, contact, of_a))
+    for (int node : side.nodes())
         if (node >= 0) bound = std::max(bound, (self ? m_uneven : m_nodes)[node]);
     return bound;
 }

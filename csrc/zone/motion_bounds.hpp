@@ -1,12 +1,15 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/sides_of.hpp"
 
 /// Bounds on how far things move when the coordinates of a zone change, cheap enough to ask before anything exact.
 namespace diffsim {
 
 /// How far a vertex of a body at most moves when the body's coordinates change by this much, chord or arc.
 double motion_bound(const Vec6& change, double radius);
+
+/// Bound on how far the arc of a vertex leaves its chord over this turn.
+double sagitta(const Vec6& change, double radius);
 
 /// Mean motion of a cloth's nodes between two places.
 Vec3 mean_motion(const ZoneCloth& cloth, int count, const Coordinates& begin, const Coordinates& end);
@@ -19,7 +22,7 @@ public:
 
     /// Contacts of the same two objects stand one after the other: of bodies the bound is found once for all of them.
     double approach(const ZoneContact& contact) {
-        if (contact.cloth_a >= 0 || contact.cloth_b >= 0) return approach_of_cloth(contact);
+        if (contact.has_cloth()) return approach_of_cloth(contact);
         if (contact.a != m_last_a || contact.b != m_last_b) {
             m_last_a = contact.a;
             m_last_b = contact.b;
@@ -31,7 +34,9 @@ public:
 private:
     double body(int index) const;
     double approach_of_cloth(const ZoneContact& contact) const;
-    double of(const ZoneContact& contact, bool of_a, bool self) const;
+    double of(const SideOfBody& side, bool self) const;
+    double of(const SideOfCloth& side, bool self) const;
+    static double of(const SideOfGround&, bool) { return 0.0; }
 
     const Zone& m_zone;
     const Coordinates &m_begin, &m_end;

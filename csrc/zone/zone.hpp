@@ -5,6 +5,7 @@
 #include "contact/contact_derivatives.hpp"
 #include "dynamics/cloth_elasticity.hpp"
 #include "zone/block_system.hpp"
+#include "zone/contact_set.hpp"
 
 /// An impact zone: bodies and cloths that may touch during a step, solved together.
 ///
@@ -23,7 +24,7 @@ struct ZoneBody {
     Mat3 inverse_inertia = Mat3::Zero();
     double mass = kInfinity;     ///< infinite for bodies that do not yield
     Vec6 target = Vec6::Zero();  ///< ŷ: where a dynamic body goes when nothing touches it, a kinematic one is driven
-    Vec6 warm = Vec6::Zero();    ///< last step's motion: dt (w0, v0)
+    Vec6 last_motion = Vec6::Zero();  ///< last step's motion: dt (w0, v0)
 };
 
 /// M p
@@ -43,9 +44,9 @@ inline Vec6 inverse_mass_times(const ZoneBody& body, const Vec6& p) {
 struct ZoneNode {
     Vec3 start = Vec3::Zero();  ///< at the start of the step, zone frame
     double mass = 0.0;
-    bool pinned = false;         ///< moves to its target whatever happens
-    Vec3 target = Vec3::Zero();  ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
-    Vec3 warm = Vec3::Zero();    ///< last step's motion: dt v0
+    bool pinned = false;              ///< moves to its target whatever happens
+    Vec3 target = Vec3::Zero();       ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
+    Vec3 last_motion = Vec3::Zero();  ///< last step's motion: dt v0
 };
 
 /// A cloth; all its nodes are in the zone.
@@ -68,31 +69,11 @@ struct PassiveBodies {
     BoxTree tree;  ///< over boxes inflated by the bodies' margins, world frame
 };
 
-struct ZoneContact {
-    Contact contact;
-    int a, b;                        ///< indices into Zone::bodies, kNobody for cloth; b is kGround with the ground
-    int cloth_a = -1, cloth_b = -1;  ///< indices into Zone::cloths, -1 for others
-    int pair;                        ///< block of the Hessian where two bodies yield, or -1
-    ContactRange range;
-    ContactStiffness stiffness;
-    double shift = 0.0;  ///< of range.rest, so that a hard contact's force acts at its rest distance [m]
-};
-
-/// The vertices of bodies in features of their contacts with other objects. Most are in several: each is placed once.
-struct FeatureVertices {
-    struct Entry {
-        int body, vertex;
-    };
-    std::vector<Entry> entries;
-    std::vector<int> first;    ///< per body: its vertex v stands at first[body] + v of ZonePoint::vertices
-    std::vector<char> listed;  ///< whether it stands there; only vertices in entries do
-};
-
 /// Bodies (the dynamic ones first) and the contacts that can become active.
 struct Zone {
     const Model* model = nullptr;
-    double compliance = 0.0;     ///< of the contacts; with `hard`, of the steps towards their multipliers
-    bool hard = false;           ///< contacts do not give way: Eq. 6 as written
+    double compliance = 0.0;     ///< of the contacts; of exact ones, of the first step towards their multipliers
+    bool exact_contact = false;  ///< contacts do not give way: Eq. 6 as written
     Vec3 origin = Vec3::Zero();  ///< of the zone frame, world
     double ground_height = 0.0;  ///< zone frame
     double dt = 0.0;             ///< [s]
@@ -103,144 +84,26 @@ struct Zone {
     const std::vector<ClothParameters>* cloth_parameters = nullptr;  ///< of all cloths of the model
     bool elastic = true;        ///< false: cloth is loose nodes, as in the contact pass of split coupling
     bool contacts_off = false;  ///< as in its elastic pass
-    std::vector<ZoneContact> contacts;
-    FeatureVertices feature_vertices;  ///< of the contacts
-    IndexPairs pairs;                  ///< of dynamic bodies with contacts
+    ContactSet contacts;
 
     const CollisionMesh& mesh(int body) const { return model->bodies[bodies[body].id].mesh; }
     int body_count() const { return static_cast<int>(bodies.size()); }
     int node_count() const { return static_cast<int>(nodes.size()); }
     const Cloth& cloth(int index) const { return model->cloths[cloths[index].id]; }
+    /// Whether forces move this body; false for the ground and for nobody.
     bool yields(int body) const { return body >= 0 && body < dynamic_count; }
 };
-
-/// Remove its contacts.
-void clear_contacts(Zone& zone);
 
 /// Have the vertices of bodies that a contact needs placed with the zone.
 void list_feature_vertices(Zone& zone, const ZoneContact& contact);
 
-/// Compliance 0 asks for hard contacts.
-inline void set_compliance(Zone& zone, double compliance) {
-    zone.hard = compliance == 0.0;
-    zone.compliance = zone.hard ? kDefaultCompliance : compliance;
-}
-
-/// Empty a zone, for bodies and cloths of a model to join it.
-void start_zone(
+/// Make an empty zone in the memory of another one, for bodies and cloths of a model to join: the one way to make a zone.
+/// Compliance 0 asks for exact ones. Returns `zone`.
+Zone& make_zone(
     Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
     const Vec3& origin);
 
 /// Pose of a body at its coordinates.
 Pose pose_at(const ZoneBody& body, const Vec6& y);
-
-/// Widen the range of contacts whose objects start the step next to their pole; see rescued_range.
-void rescue_contacts(Zone& zone);
-
-/// A contact below its rest distance.
-struct ActiveContact {
-    ActiveContact(int k, const Contact& contact, const Surface& a, const Surface& b, double ground_height)
-        : index(k), geometry(contact, a, b, ground_height) {}
-
-    int index;  ///< into Zone::contacts
-    ContactGeometry geometry;
-};
-
-/// The zone at some coordinates: poses, distances, energy.
-struct ZonePoint {
-    Coordinates y;
-    std::vector<Pose> poses;
-    std::vector<Vec3> nodes;        ///< positions, zone frame
-    std::vector<Vec3> vertices;     ///< of bodies, zone frame; those of Zone::feature_vertices
-    std::vector<double> distances;  ///< one per contact; beyond its rest distance maybe a lower bound [m]
-    std::vector<ActiveContact> active;
-    double energy = 0.0;          ///< infinite at or below a pole
-    double contact_energy = 0.0;  ///< the contacts' part
-    double elastic_energy = 0.0;  ///< the cloths' part, dt² Ψ
-};
-
-/// Find the rest of a point from its coordinates. `before`: a point that was evaluated with the same list of contacts, or
-/// null. Pairs that cannot have come near since then are left out, with what is known of their distances.
-void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before = nullptr);
-
-/// Where bodies and nodes are at these coordinates.
-void place(const Zone& zone, const Coordinates& y, std::vector<Pose>& poses, std::vector<Vec3>& nodes);
-
-/// The surfaces of a contact's two objects; the second is empty with the ground.
-Surface surface_a(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
-Surface surface_b(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
-
-/// The geometry of a contact where bodies and nodes are at these places.
-ContactGeometry contact_geometry(
-    const Zone& zone, const ZoneContact& contact, const std::vector<Pose>& poses, const std::vector<Vec3>& nodes);
-
-/// The nodes of the zone that a contact's feature of a cloth has; -1 fills the rest.
-std::array<int, 3> feature_nodes(const Zone& zone, const ZoneContact& contact, bool of_a);
-
-/// How the second derivative is taken.
-enum class Curvature {
-    none,    ///< gradient only
-    full,    ///< the Hessian, as much of its negative curvature cut off as told
-    dropped  ///< contacts are rows of constant direction (the paper's linearised constraint)
-};
-
-/// All contacts of two bodies, or of one and the ground.
-struct BodyContacts {
-    int a, b;
-    ContactStiffness stiffness;
-    Vector<12> gradient;  ///< along both twists
-};
-
-struct ZoneDerivatives {
-    Coordinates gradient;  ///< zero at pinned nodes
-    std::vector<BodyContacts> body_contacts;
-    std::vector<Vec3> torque;    ///< world-frame gradient with respect to turns, contacts only
-    std::vector<Mat3> jacobian;  ///< of the bodies' turns: d(turn)/d(theta)
-    double largest_force;      ///< of a contact on a body, of all but inertia on a node, in units of |L⁻¹ g|, M = L Lᵀ
-    double largest_stiffness;  ///< sum over a body's contacts, in units of |L⁻¹ dg/dx|; of a node with the cloth's own
-};
-
-/// The pattern of the elastic Hessian, nodes alone.
-BlockPattern cloth_pattern(const Zone& zone);
-
-/// The pattern of a zone's Hessian without the contacts of cloth.
-BlockPattern base_pattern(const Zone& zone);
-
-/// Extend the system's pattern by what contacts of cloth couple, if need be.
-void ensure_pattern(const Zone& zone, const std::vector<int>& contacts, BlockSystem& system);
-
-/// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's base pattern, and is extended
-/// by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix. With all negative
-/// curvature cut off (CutShare), the contacts' part is positive semidefinite as well.
-void differentiate(
-    const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
-    CutShare cut = kNothingCut);
-
-/// A contact with a force of its own, as a row of a ContactModel has it.
-struct PushingContact {
-    int index;  ///< into Zone::contacts
-    const ContactGeometry* geometry;
-    double force;  ///< [kg·m]
-};
-
-/// The Hessian of inertia and elasticity, and what contacts that push with these forces add to it by their curvature alone,
-/// so much of the negative curvature cut off. `system` has a pattern of these contacts.
-void differentiate_smooth(
-    const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
-    ZoneDerivatives& derivatives, BlockSystem& system);
-
-/// Add a block to a system's rows of node i and columns of node j, once per pair. Pinned nodes have none.
-void add_node_block(const Zone& zone, int i, int j, const Mat3& block, BlockSystem& system);
-
-/// Add the elastic Hessian of the zone's cloths to a system, times dt². Pinned nodes are left out.
-void add_elastic_hessian(const Zone& zone, const ZonePoint& point, CutShare cut, BlockSystem& system);
-
-/// d(twist)/dy of a body at theta: turns by the left Jacobian, shifts unchanged.
-Mat6 chart_jacobian(const Vec6& y);
-
-/// Second derivative of the chart itself: what turning contributes to the Hessian for a contact torque.
-Mat3 chart_curvature(const Vec6& y, const Vec3& torque);
 
 }  // namespace diffsim

@@ -3,6 +3,9 @@
 #include <algorithm>
 #include <cmath>
 
+#include "zone/contacts.hpp"
+#include "zone/elasticity.hpp"
+
 namespace diffsim {
 namespace {
 
@@ -19,14 +22,14 @@ Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double p
         const ZoneBody& body = zone.bodies[i];
         const Vec6& g = derivatives.gradient.bodies[i];
         residual = std::max(residual, scaled(body.inverse_inertia, 1.0 / body.mass, g));
-        reference = std::max(reference, scaled(body.inertia, body.mass, body.warm - body.target));
+        reference = std::max(reference, scaled(body.inertia, body.mass, body.last_motion - body.target));
     }
     for (int i = 0; i < zone.node_count(); ++i) {
         const ZoneNode& node = zone.nodes[i];
         if (node.pinned) continue;
         const double root_mass = std::sqrt(node.mass);
         residual = std::max(residual, derivatives.gradient.nodes[i].norm() / root_mass);
-        reference = std::max(reference, (node.warm - node.target).norm() * root_mass);
+        reference = std::max(reference, (node.last_motion - node.target).norm() * root_mass);
     }
     // Nothing pushes here and nothing did before: only the exact answer will do, or a step lost in rounding.
     if (!(reference > 0.0)) return {residual > 0.0 ? 1.0 : 0.0, 0.0};
@@ -35,29 +38,8 @@ Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double p
 
 double energy_noise(
     const Zone& zone, const ZonePoint& point, const BlockSystem& system, double position, std::vector<double>& pushed) {
-    // The errors of one body's contacts may all add up. Those of different bodies are independent: their sum grows with the
-    // root of their number.
-    double force_sum = 0.0;
-    pushed.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
-    for (const ActiveContact& active : point.active) {
-        if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
-        const ZoneContact& contact = zone.contacts[active.index];
-        const double pole = contact.range.rest - contact.range.pole;
-        const double force =
-            contact_potential(contact.range.rest - active.geometry.distance, pole, contact.stiffness.value).force;
-        const bool yields_a = zone.yields(contact.a), yields_b = zone.yields(contact.b);
-        if (yields_a) pushed[contact.a] += force;
-        if (yields_b) pushed[contact.b] += force;
-        if (!yields_a && !yields_b) force_sum += force;
-    }
-    double square_sum = 0.0;
-    for (double force : pushed) square_sum += force * force;
-    force_sum += std::sqrt(square_sum);
-    // The elements' forces |f| = sqrt(2 k E), by Cauchy-Schwarz Σ |f| <= sqrt(2 Σk ΣE).
-    double stiffness_sum = 0.0;
-    for (int i = 0; i < zone.node_count(); ++i)
-        if (!zone.nodes[i].pinned) stiffness_sum += system.node_diagonal(i).trace();
-    force_sum += std::sqrt(2.0 * stiffness_sum * point.elastic_energy);
+    double force_sum = contact_force_sum(zone, point, pushed);
+    force_sum += elastic_force_sum(zone, point, system);
     return 1e-15 * std::abs(point.energy) + 8.0 * kEpsilon * position * force_sum;
 }
 

@@ -1,7 +1,8 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
+/// How near a zone is to its minimum, and what rounding lets one know of it.
 namespace diffsim {
 
 /// How far a point is from the minimum.

@@ -5,6 +5,7 @@
 
 #include "collision/ccd.hpp"
 #include "zone/motion_bounds.hpp"
+#include "zone/sides_of.hpp"
 
 namespace diffsim {
 namespace {
@@ -12,12 +13,6 @@ namespace {
 constexpr double kRoom = 0.05;     // of its thickness: room on all sides of a body at rest
 constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
-
-/// Bound on how far the arc of a vertex leaves its chord over this turn.
-double sagitta(const Vec6& change, double radius) {
-    const double angle = change.head<3>().norm();
-    return radius * std::min(0.125 * angle * angle, 2.0);
-}
 
 SweptMesh swept_mesh(const Zone& zone, int body, const Vec6& begin, const Vec6& end, double slack) {
     const ZoneBody& b = zone.bodies[body];
@@ -57,14 +52,6 @@ SweptCloth sweep_cloth(
     return swept;
 }
 
-/// Sum of the masses of a feature's nodes.
-double feature_mass(const Zone& zone, const ZoneContact& contact, bool of_a) {
-    double mass = 0.0;
-    for (int node : feature_nodes(zone, contact, of_a))
-        if (node >= 0) mass += zone.nodes[node].mass;
-    return mass;
-}
-
 /// Let bodies that do not yield join the zone where its moving bodies come near them.
 void join_passive(
     Zone& zone, const PassiveBodies& passive, const std::vector<Box>& dynamic_boxes, Coordinates& begin,
@@ -102,32 +89,17 @@ double contact_margins(const Model& model, const Contact& contact) {
 }
 
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b) {
-    if (a.cloth < 0 && b.cloth < 0 && !zone.hard && !zone.contacts.empty()) {
-        // Of the same bodies as the last one: only the features differ.
-        const Contact& last = zone.contacts.back().contact;
-        if (last.object_a == contact.object_a && last.object_b == contact.object_b) {
-            zone.contacts.push_back(zone.contacts.back());
-            zone.contacts.back().contact = contact;
-            list_feature_vertices(zone, zone.contacts.back());
-            return;
-        }
+    ContactSet& set = zone.contacts;
+    const bool own_law = a.cloth >= 0 || b.cloth >= 0 || zone.exact_contact;
+    if (set.append(contact, a, b, own_law)) {
+        const ContactRange range = contact_range(
+            contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
+        set.laws.push_back({range, {}});
+        set.laws.back().stiffness = with_sides(zone, set[set.size() - 1], [&](const auto& side_a, const auto& side_b) {
+            return contact_stiffness(side_a.mass(), side_b.mass(), zone.contacts.memory.compliance);
+        });
     }
-    ZoneContact entry;
-    entry.contact = contact;
-    entry.a = a.body;
-    entry.b = b.body;
-    entry.cloth_a = a.cloth;
-    entry.cloth_b = b.cloth;
-    entry.pair = -1;
-    entry.range = contact_range(
-        contact_margins(*zone.model, contact), zone.model->pair_thickness(contact.object_a, contact.object_b));
-    const double mass_a = a.cloth >= 0 ? feature_mass(zone, entry, true) : zone.bodies[a.body].mass;
-    const double mass_b = b.cloth >= 0        ? feature_mass(zone, entry, false)
-                          : b.body == kGround ? kInfinity
-                                              : zone.bodies[b.body].mass;
-    entry.stiffness = contact_stiffness(mass_a, mass_b, zone.compliance);
-    zone.contacts.push_back(entry);
-    list_feature_vertices(zone, entry);
+    list_feature_vertices(zone, set[set.size() - 1]);
 }
 
 namespace {
@@ -149,7 +121,7 @@ public:
           m_features(coverage.scratch.features) {}
 
     void run() {
-        clear_contacts(m_zone);
+        m_zone.contacts.clear();
         m_coverage.slack.clear();
         m_coverage.cloth_slack.clear();
         m_meshes.clear();
@@ -242,13 +214,11 @@ private:
             collect_feature_pairs(m_feature_boxes[i], m_feature_boxes[j], m_features);
             if (j >= m_zone.body_count()) drop_distant_pairs(m_meshes[i], m_meshes[j], m_features);
             if (m_features.empty()) continue;
-            const std::size_t first = m_zone.contacts.size();
             for (const FeaturePair& f : m_features)
                 add_contact(m_zone, {id(i), id(j), f.type, f.feature_a, f.feature_b}, object(i), object(j));
             if (j >= m_zone.dynamic_count) continue;
-            for (std::size_t k = first; k < m_zone.contacts.size(); ++k)
-                m_zone.contacts[k].pair = static_cast<int>(m_zone.pairs.size());
-            m_zone.pairs.emplace_back(i, j);
+            m_zone.contacts.pairs.back().block = static_cast<int>(m_zone.contacts.blocks.size());
+            m_zone.contacts.blocks.emplace_back(i, j);
         }
     }
 
@@ -329,9 +299,10 @@ class MotionEnd {
 public:
     MotionEnd(const Zone& zone, const Coordinates& y) : m_zone(zone), m_y(y) {}
 
-    Surface surface(const ZoneContact& contact, bool of_a) {
+    template <class Side>
+    Surface surface(const Side& side) {
         if (m_poses.empty() && m_nodes.empty()) place(m_zone, m_y, m_poses, m_nodes);
-        return of_a ? surface_a(m_zone, contact, m_poses, m_nodes) : surface_b(m_zone, contact, m_poses, m_nodes);
+        return side.surface(m_poses, m_nodes);
     }
 
 private:
@@ -354,17 +325,20 @@ double allowed_step(
     for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
         const ZoneContact& contact = zone.contacts[k];
         // A pair that is already nearer than the floor may use up most of what is left above the pole.
-        const double room = point.distances[k] - contact.range.pole;
+        const double room = point.distances[k] - contact.law.range.pole;
         CcdOptions ccd;
-        const double wanted = clearance == Clearance::floor ? contact.range.floor : contact.range.landing;
-        const double keep = std::min(wanted - contact.range.pole, (clearance == Clearance::floor ? 0.1 : 0.8) * room);
-        ccd.min_distance = contact.range.pole + keep;
+        const double wanted = clearance == Clearance::floor ? contact.law.range.floor : contact.law.range.landing;
+        const double keep =
+            std::min(wanted - contact.law.range.pole, (clearance == Clearance::floor ? 0.1 : 0.8) * room);
+        ccd.min_distance = contact.law.range.pole + keep;
         ccd.tolerance = 0.2 * keep;
         if (impacts == nullptr) ccd.until = step;
         if (ccd.until * motion.approach(contact) < room - 1.2 * keep) continue;
-        const double toi = contact_toi(
-            contact.contact, {surface_a(zone, contact, point.poses, point.nodes), end.surface(contact, true)},
-            {surface_b(zone, contact, point.poses, point.nodes), end.surface(contact, false)}, zone.ground_height, ccd);
+        const double toi = with_sides(zone, contact, [&](const auto& a, const auto& b) {
+            return contact_toi(
+                contact.contact, {a.surface(point.poses, point.nodes), end.surface(a)},
+                {b.surface(point.poses, point.nodes), end.surface(b)}, zone.ground_height, ccd);
+        });
         if (toi == kNoImpact) continue;
         step = std::min(step, toi);
         if (impacts != nullptr) impacts->push_back({static_cast<int>(k), toi});

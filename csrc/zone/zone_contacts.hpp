@@ -1,7 +1,8 @@
 #pragma once
 
-#include "zone/zone.hpp"
+#include "zone/zone_point.hpp"
 
+/// The listing of the contacts that a motion of a zone may bring about, and how far a motion may go.
 namespace diffsim {
 
 /// Which part of its motion a zone's list of contacts is complete for: all coordinates within `slack` of the segment
@@ -19,12 +20,6 @@ struct ContactCoverage {
         std::vector<int> vertices;
         std::vector<FeaturePair> features;
     } scratch;
-};
-
-/// An object of a zone: a body, a cloth, or {kGround}.
-struct ZoneObject {
-    int body = kNobody;
-    int cloth = -1;
 };
 
 /// The distance at which the two features of a contact rest: the sum of their margins. Features of one cloth may be nearer

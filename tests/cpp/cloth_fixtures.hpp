@@ -118,8 +118,8 @@ void for_each_pair_of_features(
     const auto pair = [&](ContactType type, int feature_a, int feature_b) {
         const Contact contact{object_a, object_b, type, feature_a, feature_b};
         if (same)
-            for (int i : feature_vertices(a, contact, true))
-                for (int j : feature_vertices(b, contact, false))
+            for (int i : feature_vertices(a, contact.on_a()))
+                for (int j : feature_vertices(b, contact.on_b()))
                     if (i >= 0 && i == j) return;
         visit(contact);
     };

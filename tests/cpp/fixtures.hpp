@@ -9,7 +9,7 @@
 #include "check.hpp"
 #include "math/rotation.hpp"
 #include "model/model.hpp"
-#include "zone/zone.hpp"
+#include "zone/zone_derivatives.hpp"
 
 namespace fixtures {
 

@@ -74,8 +74,8 @@ NearestObjects brute_force(const Scene& scene) {
     };
     const auto moves = [&](int i) { return model.is_cloth(i) || model.bodies[i].is_dynamic(); };
     const auto share = [](const CollisionMesh& mesh, const Contact& contact) {
-        for (int i : feature_vertices(mesh, contact, true))
-            for (int j : feature_vertices(mesh, contact, false))
+        for (int i : feature_vertices(mesh, contact.on_a()))
+            for (int j : feature_vertices(mesh, contact.on_b()))
                 if (i >= 0 && i == j) return true;
         return false;
     };

@@ -16,6 +16,7 @@ SCRIPTS = sorted(BENCHMARKS.glob("[a-z]*.py"))
 # Some of a script's columns, first and last among them.
 COLUMNS = {
     "adjoint_modes": ("scene", "qr_state", "exact_error_median", "dense_backward_ms"),
+    "bits": ("scene", "steps", "state", "gradient"),
     "batch": ("case", "scenes", "loop_forward_per_s", "gradient_ratio"),
     "ccd": ("case", "most_advances", "ours_us", "additive_us", "inclusion_to_ours", "inclusion_lost"),
     "cloth": ("side_nodes", "forward_contact_ms", "mujoco_step_ms", "backward_to_forward", "vbd_depth_m"),
@@ -31,7 +32,7 @@ COLUMNS = {
     "threads": ("cubes", "threads", "forward_s", "backward_speedup"),
 }
 POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times
-TEXT = ("mode", "step", "scene", "material", "name", "case", "directions", "peer", "what")
+TEXT = ("mode", "step", "scene", "material", "name", "case", "directions", "peer", "what", "state", "gradient")
 
 for package in ("matplotlib", "mujoco", "ipctk"):
     pytest.importorskip(package, reason="the benchmarks' packages: pip install .[bench]")

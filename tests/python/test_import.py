@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-LAZY_MODULES = ("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco")
+LAZY_MODULES = ("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco", "gymnasium")
 
 
 def modules_loaded_by(statement: str) -> set[str]:

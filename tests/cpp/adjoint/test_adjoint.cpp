@@ -27,6 +27,13 @@ struct Sheet {
     std::vector<double> mass;
 };
 
+/// Append a contact like this one, of another set.
+void append(ContactSet& set, const ZoneContact& contact) {
+    set.append(contact.contact, {contact.a, contact.cloth_a}, {contact.b, contact.cloth_b}, true);
+    set.laws.push_back(contact.law);
+    set.pairs.back().block = contact.block;
+}
+
 /// Bodies and cloths at rest or landing, and how they are solved.
 struct Scene {
     Model model;
@@ -72,11 +79,7 @@ struct Scene {
     }
     Zone zone() const {
         Zone result;
-        result.dt = kDt;
-        result.cloth_parameters = &materials;
-        result.model = &model;
-        set_compliance(result, compliance);
-        result.ground_height = model.ground.height;
+        make_zone(result, model, materials, compliance, kDt, Vec3::Zero());
         result.bodies = bodies;
         result.dynamic_count = static_cast<int>(bodies.size());
         for (int i = 0; i < model.cloth_count(); ++i) {
@@ -96,8 +99,10 @@ struct Scene {
         std::vector<Box> visited;
         const ZoneResult outcome = solve_zone(result, passive, ZoneOptions(), workspace, visited);
         CHECK(outcome.status == ZoneStatus::converged);
-        std::vector<ZoneContact> active;
-        for (const ActiveContact& a : workspace.point.active) active.push_back(result.contacts[a.index]);
+        ContactSet active;
+        for (const ActiveContact& a : workspace.point.active) append(active, result.contacts[a.index]);
+        active.blocks = result.contacts.blocks;
+        active.vertices = result.contacts.vertices;
         result.contacts = active;
         point.y = workspace.point.y;
         evaluate(result, point);
@@ -213,8 +218,9 @@ TEST(dense_and_qr_solve_the_same_system_on_redundant_rows) {
     check_same_system(zone, point);
 
     // Every row many times over.
-    const std::vector<ZoneContact> once = zone.contacts;
-    for (int copy = 0; copy < 4; ++copy) zone.contacts.insert(zone.contacts.end(), once.begin(), once.end());
+    const ContactSet once = zone.contacts;
+    for (int copy = 0; copy < 4; ++copy)
+        for (const ZoneContact& contact : once) append(zone.contacts, contact);
     evaluate(zone, point);
     CHECK(point.active.size() >= 100);
     check_same_system(zone, point);
@@ -239,11 +245,11 @@ TEST(stiff_contacts_cost_dense_and_qr_no_digits) {
         const Zone zone = scene.solve(point);
         CHECK(point.active.size() >= 16);
         const Coordinates upstream = random_upstream(zone, 4);
-        const auto place_gradient = [&](AdjointMode mode) {
+        const auto pose_gradient = [&](AdjointMode mode) {
             AdjointWorkspace workspace;
-            return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).place_gradient);
+            return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).pose_gradient);
         };
-        const VectorX by_lu = place_gradient(AdjointMode::dense), by_qr = place_gradient(AdjointMode::qr);
+        const VectorX by_lu = pose_gradient(AdjointMode::dense), by_qr = pose_gradient(AdjointMode::qr);
         CHECK(by_lu.norm() > 0.1);
         CHECK_NEAR(by_qr, by_lu, 1e-12 * by_lu.norm());
     }
@@ -254,7 +260,6 @@ TEST(dense_and_qr_do_without_contacts) {
     const Scene scene = stack();
     Zone zone = scene.solve(point);
     zone.contacts.clear();
-    zone.pairs.clear();
     evaluate(zone, point);
     CHECK(point.active.empty());
     check_same_system(zone, point);
@@ -329,7 +334,7 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
         CHECK_NEAR(
             by_target, numeric(kStep, 6, [](Scene& s, const VectorX& x) { s.bodies[0].target += x; }), kDifferences);
 
-        const double scale = flatten(adjoint.place_gradient).norm();
+        const double scale = flatten(adjoint.pose_gradient).norm();
         CHECK(scale > 0.1);
         double by_stiffness = 0.0;
         for (std::size_t sheet = 0; sheet < 2; ++sheet) {
@@ -341,7 +346,7 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
                 const int i = first + static_cast<int>(k);
                 const ZoneNode& node = zone.nodes[i];
                 const Vec3& z_node = adjoint.multiplier.nodes[i];
-                const Vec3 &place = adjoint.place_gradient.nodes[i], &start = adjoint.start_gradient[i];
+                const Vec3 &place = adjoint.pose_gradient.nodes[i], &start = adjoint.start_gradient[i];
                 const VectorX targeted =
                     numeric(kStep, 3, [&](Scene& s, const VectorX& x) { s.sheets[sheet].target[k] += x; });
                 CHECK_NEAR(node.pinned ? place : Vec3(node.mass * z_node), targeted, kDifferences * (1.0 + scale));
@@ -399,7 +404,7 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
             CHECK_NEAR(by_target, fixtures::numeric_gradient(targeted, VectorX::Zero(6), kStep), kDifferences);
 
             // The base pose moves, targets and inertia stay: a turn arrives at the end of the step turned by Exp(theta).
-            const Vec6& pose = adjoint.place_gradient.bodies[i];
+            const Vec6& pose = adjoint.pose_gradient.bodies[i];
             by_start << exp_rotation(point.y.bodies[i].head<3>()).transpose() * pose.head<3>(), pose.tail<3>();
             const auto started = [&](const VectorX& x) {
                 Scene changed = scene;
@@ -438,8 +443,7 @@ TEST(what_is_not_asked_for_is_left_at_zero) {
         const ZoneAdjoint all = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
         const ZoneAdjoint none = zone_adjoint(zone, point, upstream, AdjointMode::exact, nothing, workspace);
         CHECK(flatten(none.multiplier) == flatten(all.multiplier));
-        for (std::size_t i = 0; i < all.place_gradient.nodes.size(); ++i)
-            CHECK(none.place_gradient.nodes[i].isZero(0.0));
+        for (std::size_t i = 0; i < all.pose_gradient.nodes.size(); ++i) CHECK(none.pose_gradient.nodes[i].isZero(0.0));
         for (std::size_t i = 0; i < all.mass_gradient.size(); ++i) CHECK(none.mass_gradient[i] == 0.0);
         CHECK(all.cloth_gradient[0].stretch != 0.0);
         CHECK(none.cloth_gradient[0].stretch == 0.0);
@@ -461,7 +465,7 @@ TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
         changed.plant_tree();
         return flatten(upstream).dot(changed.solution());
     };
-    const Vec6& analytic = adjoint.place_gradient.bodies[1];
+    const Vec6& analytic = adjoint.pose_gradient.bodies[1];
     CHECK(analytic.tail<3>().norm() > 1e-2);
     CHECK_NEAR(
         analytic, fixtures::numeric_gradient(moved, VectorX::Zero(6), kStep), 10.0 * kDifferences * analytic.norm());

@@ -43,10 +43,11 @@ struct Situation {
         other.b = moved(b, x.tail<6>());
         return other;
     }
+    ContactLaw law() const { return {range, {kStiffness, 0.0, 0.0}}; }
     ContactGeometry geometry() const { return contact_geometry(model, contact, a, b, 0.0); }
-    double energy() const { return contact_energy(geometry(), range, kStiffness); }
+    double energy() const { return contact_energy(geometry(), law()); }
     ContactDerivatives<12> derivatives(bool with_curvature = true) const {
-        return contact_derivatives(geometry(), range, kStiffness, BodySide{a.t}, BodySide{b.t}, true, with_curvature);
+        return contact_derivatives(geometry(), law(), BodySide{a.t}, BodySide{b.t}, true, with_curvature);
     }
     /// Gradient in the chart of the poses from which x counts: a turn's is Jᵀ of that along the twist at x.
     VectorX gradient(const VectorX& x) const {
@@ -75,7 +76,7 @@ struct Situation {
     std::string kind() const {
         const ContactGeometry g = geometry();
         if (g.sine_sq < kParallelLimit) return "mollified";
-        const int slides = g.closest.slide_count_a + g.closest.slide_count_b;
+        const int slides = g.closest.a.slide_count + g.closest.b.slide_count;
         if (contact.type == ContactType::edge_edge) return std::string("edge-edge ") + "021"[slides];
         return std::string("vertex-") + (slides == 2 ? "face" : slides == 1 ? "edge" : "vertex");
     }
@@ -165,7 +166,7 @@ TEST(contact_derivatives_agree_with_differences_for_nearly_parallel_edges) {
         s.press(0.4);
         check_derivatives(s, kMollifiedDifferences);
         const ContactGeometry g = s.geometry();
-        (g.closest.slide_count_a + g.closest.slide_count_b == 2 ? inside : at_ends) += 1;
+        (g.closest.a.slide_count + g.closest.b.slide_count == 2 ? inside : at_ends) += 1;
     }
     CHECK(inside >= 15);
     CHECK(at_ends >= 15);
@@ -264,7 +265,7 @@ TEST(on_the_border_of_a_feature_second_derivatives_are_the_mean_of_both_sides) {
     const auto check = [&](Situation s) {
         const ContactGeometry g = s.geometry();
         const ClosestPoints& closest = g.closest;
-        if (g.distance > 0.35 || g.sine_sq < kParallelLimit || closest.border_count_a + closest.border_count_b == 0)
+        if (g.distance > 0.35 || g.sine_sq < kParallelLimit || closest.a.border_count + closest.b.border_count == 0)
             return false;
         NOTE(s.kind());
         s.range = {1.0, 1.0, 0.0, 0.0, 0.0};
@@ -316,7 +317,7 @@ TEST(exactly_parallel_edges_resist_turning) {
 TEST(ground_derivatives_agree_with_differences) {
     const Model model = two_bodies();
     check::Random random(5);
-    const ContactRange range{2.0, 2.0, -2.0, -2.0, -2.0};
+    const ContactLaw law{{2.0, 2.0, -2.0, -2.0, -2.0}, {kStiffness, 0.0, 0.0}};
     constexpr std::array<int, 3> kVertices = {3, 0, 1};
     for (int k = 0; k < 10; ++k) {
         NOTE(k);
@@ -329,10 +330,10 @@ TEST(ground_derivatives_agree_with_differences) {
                 model, {0, kGround, ContactType::vertex_patch, vertex, -1}, moved, {}, ground_height);
         };
         const auto contacts = [&](const VectorX& x) {
-            GroundContacts result;
+            GroundSums result;
             for (const int vertex : kVertices) {
                 const ContactGeometry g = at(x, vertex);
-                result.add(g.distance, g.closest.point_a - center(x), range, kStiffness);
+                result.add(g.distance, g.closest.a.point - center(x), law);
             }
             return result;
         };
@@ -343,7 +344,7 @@ TEST(ground_derivatives_agree_with_differences) {
         };
         const auto energy = [&](const VectorX& x) {
             double sum = 0.0;
-            for (const int vertex : kVertices) sum += contact_energy(at(x, vertex), range, kStiffness);
+            for (const int vertex : kVertices) sum += contact_energy(at(x, vertex), law);
             return sum;
         };
         const VectorX zero = VectorX::Zero(6), g = gradient(zero);
@@ -351,9 +352,8 @@ TEST(ground_derivatives_agree_with_differences) {
         Mat6 rows = Mat6::Zero();
         for (const int vertex : kVertices) {
             const ContactGeometry geometry = at(zero, vertex);
-            const Vec6 row = GroundContacts::row(geometry.closest.point_a - pose.t);
-            rows += contact_potential(range.rest - geometry.distance, range.rest - range.pole, kStiffness).stiffness *
-                    row * row.transpose();
+            const Vec6 row = GroundSums::row(geometry.closest.a.point - pose.t);
+            rows += normal_force(law, geometry.distance).stiffness * row * row.transpose();
         }
         CHECK(g.head<3>().norm() > 1e-3);
         CHECK_NEAR(g, fixtures::numeric_gradient(energy, zero, kStep), kDifferences * g.norm());

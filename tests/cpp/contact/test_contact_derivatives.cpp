@@ -38,8 +38,8 @@ struct Situation {
     }
     Surface surface_b() const { return {&mesh_b, nullptr, nodes_b.data()}; }
     static void move_nodes(
-        const CollisionMesh& mesh, const Contact& contact, bool of_a, const VectorX& x, std::vector<Vec3>& nodes) {
-        const std::array<int, 3> vertices = feature_vertices(mesh, contact, of_a);
+        const CollisionMesh& mesh, const Feature& feature, const VectorX& x, std::vector<Vec3>& nodes) {
+        const std::array<int, 3> vertices = feature_vertices(mesh, feature);
         for (int k = 0; k < 3; ++k)
             if (vertices[static_cast<std::size_t>(k)] >= 0)
                 nodes[vertices[static_cast<std::size_t>(k)]] += x.segment<3>(3 * k);
@@ -49,14 +49,19 @@ struct Situation {
         if (body_a)
             other.pose = {exp_rotation(Vec3(x.head<3>())) * pose.R, pose.t + x.segment<3>(3)};
         else
-            move_nodes(mesh_a, contact, true, x.head<9>(), other.nodes_a);
-        move_nodes(mesh_b, contact, false, x.tail<9>(), other.nodes_b);
+            move_nodes(mesh_a, contact.on_a(), x.head<9>(), other.nodes_a);
+        move_nodes(mesh_b, contact.on_b(), x.tail<9>(), other.nodes_b);
         return other;
     }
+    ContactLaw law() const { return {range, {kStiffness, 0.0, 0.0}}; }
     ContactGeometry geometry() const { return {contact, surface_a(), surface_b(), 0.0}; }
-    double energy() const { return contact_energy(geometry(), range, kStiffness); }
-    ClothSide side_a(const ContactGeometry& g) const { return cloth_side(contact, g, surface_a(), true); }
-    ClothSide side_b(const ContactGeometry& g) const { return cloth_side(contact, g, surface_b(), false); }
+    double energy() const { return contact_energy(geometry(), law()); }
+    ClothSide side_a(const ContactGeometry& g) const {
+        return cloth_side(g.closest.a, g.normal, contact.on_a(), surface_a());
+    }
+    ClothSide side_b(const ContactGeometry& g) const {
+        return cloth_side(g.closest.b, g.normal, contact.on_b(), surface_b());
+    }
 
     struct Derivatives {
         VectorX gradient, row;
@@ -64,7 +69,7 @@ struct Situation {
     };
     template <class A>
     Derivatives derivatives_with(const ContactGeometry& g, const A& a, bool with_curvature) const {
-        const auto d = contact_derivatives(g, range, kStiffness, a, side_b(g), true, with_curvature);
+        const auto d = contact_derivatives(g, law(), a, side_b(g), true, with_curvature);
         CHECK(d.row == distance_gradient(g, a, side_b(g)));
         return {d.gradient, d.row, d.hessian};
     }
@@ -99,7 +104,7 @@ struct Situation {
         const ContactGeometry g = geometry();
         const std::string partner = body_a ? "body-" : "cloth-";
         if (g.sine_sq < kParallelLimit) return partner + "mollified";
-        const int slides = g.closest.slide_count_a + g.closest.slide_count_b;
+        const int slides = g.closest.a.slide_count + g.closest.b.slide_count;
         const char* const type = contact.type == ContactType::edge_edge      ? "edges "
                                  : contact.type == ContactType::vertex_patch ? "vertex-patch "
                                                                              : "patch-vertex ";
@@ -195,7 +200,7 @@ TEST(contact_derivatives_with_cloth_agree_with_differences_for_nearly_parallel_e
         }
         if (s.geometry().sine_sq >= kParallelLimit || s.geometry().distance < 0.1 || !s.is_stable()) continue;
         const ContactGeometry g = s.geometry();
-        int& hit = cases_hit[s.kind() + (g.closest.slide_count_a + g.closest.slide_count_b == 2 ? " inside" : " end")];
+        int& hit = cases_hit[s.kind() + (g.closest.a.slide_count + g.closest.b.slide_count == 2 ? " inside" : " end")];
         if (hit >= 8) continue;
         s.press(0.4);
         check_derivatives(s, kMollifiedDifferences);
@@ -218,9 +223,11 @@ TEST(a_cloth_side_holds_the_closest_point_and_how_it_slides) {
         for (const bool of_a : {true, false}) {
             NOTE(of_a);
             const Surface surface = of_a ? s.surface_a() : s.surface_b();
-            const ClothSide side = cloth_side(s.contact, g, surface, of_a);
-            const std::array<int, 3> vertices = feature_vertices(*surface.mesh, s.contact, of_a);
-            const int slides = of_a ? g.closest.slide_count_a : g.closest.slide_count_b;
+            const ClosestPoint& closest = of_a ? g.closest.a : g.closest.b;
+            const Feature feature = of_a ? s.contact.on_a() : s.contact.on_b();
+            const ClothSide side = cloth_side(closest, g.normal, feature, surface);
+            const std::array<int, 3> vertices = feature_vertices(*surface.mesh, feature);
+            const int slides = closest.slide_count;
             Mat3 nodes = Mat3::Zero();
             for (int i = 0; i < 3; ++i) {
                 if (vertices[static_cast<std::size_t>(i)] >= 0)
@@ -230,7 +237,7 @@ TEST(a_cloth_side_holds_the_closest_point_and_how_it_slides) {
             }
             CHECK_NEAR(side.weights.sum(), 1.0, 1e-12);
             CHECK(side.weights.minCoeff() >= -1e-12);
-            CHECK_NEAR(nodes * side.weights, of_a ? g.closest.point_a : g.closest.point_b, 1e-12);
+            CHECK_NEAR(nodes * side.weights, closest.point, 1e-12);
             for (int i = 0; i < slides; ++i) {
                 const Vec3& rate = side.slide[static_cast<std::size_t>(i)];
                 const Vec3 slide = nodes * rate;
@@ -256,8 +263,7 @@ TEST(curvature_of_contacts_with_cloth_can_be_left_out) {
         if (s.geometry().distance < 0.1 || s.geometry().sine_sq < kParallelLimit) continue;
         s.press(0.3);
         const Situation::Derivatives full = s.derivatives(), dropped = s.derivatives(false);
-        const double stiffness =
-            contact_potential(s.range.rest - s.geometry().distance, s.range.rest - s.range.pole, kStiffness).stiffness;
+        const double stiffness = normal_force(s.law(), s.geometry().distance).stiffness;
         CHECK(dropped.gradient == full.gradient);
         CHECK_NEAR(dropped.hessian, stiffness * full.row * full.row.transpose(), 1e-12 * full.hessian.norm());
         CHECK((full.hessian - dropped.hessian).norm() > 1e-3 * full.hessian.norm());

@@ -62,11 +62,11 @@ ClosestPoints closest(const Vec3& x, const std::vector<Vec3>& p) {
 void check_vertex_polygon(const Vec3& x, const std::vector<Vec3>& p, const ClosestPoints& found) {
     const int count = static_cast<int>(p.size());
     CHECK(near_distance(found.distance(), point_polygon(x, p)));
-    CHECK(point_polygon(found.point_b, p) <= kSearch);
-    CHECK(found.point_a == x);
-    CHECK(found.slide_count_a == 0);
-    const Vec3 offset = found.point_a - found.point_b;
-    if (found.slide_count_b == 2) {
+    CHECK(point_polygon(found.b.point, p) <= kSearch);
+    CHECK(found.a.point == x);
+    CHECK(found.a.slide_count == 0);
+    const Vec3 offset = found.a.point - found.b.point;
+    if (found.b.slide_count == 2) {
         CHECK(found.feature_code == 0);
         return;
     }
@@ -74,12 +74,12 @@ void check_vertex_polygon(const Vec3& x, const std::vector<Vec3>& p, const Close
     const int edge = static_cast<int>(found.feature_code - 1) / 3, where = static_cast<int>(found.feature_code - 1) % 3;
     CHECK(edge < count);
     const Vec3 &p0 = p[edge], &p1 = p[(edge + 1) % count];
-    CHECK(found.slide_count_b == (where == 2 ? 1 : 0));
-    if (where == 0) CHECK(found.point_b == p0);
+    CHECK(found.b.slide_count == (where == 2 ? 1 : 0));
+    if (where == 0) CHECK(found.b.point == p0);
     CHECK(where != 1);  // every corner has one code, as the beginning of an edge
     if (where == 2) {
-        CHECK(found.edge_b == Vec3(p1 - p0));
-        CHECK_NEAR(found.edge_b.normalized().dot(offset), 0.0, 10.0 * kRounding);
+        CHECK(found.b.edge == Vec3(p1 - p0));
+        CHECK_NEAR(found.b.edge.normalized().dot(offset), 0.0, 10.0 * kRounding);
     }
 }
 
@@ -93,15 +93,15 @@ void check_edge_edge(const EdgePair& e, double tolerance) {
     const ClosestPoints found = closest(e);
     const double reference = segment_segment(e.a0, e.a1, e.b0, e.b1);
     CHECK(near_distance(found.distance(), reference) || std::abs(found.distance() - reference) <= tolerance);
-    CHECK(point_segment(found.point_a, e.a0, e.a1) <= kRounding);
-    CHECK(point_segment(found.point_b, e.b0, e.b1) <= kRounding);
+    CHECK(point_segment(found.a.point, e.a0, e.a1) <= kRounding);
+    CHECK(point_segment(found.b.point, e.b0, e.b1) <= kRounding);
     const int where_a = static_cast<int>(found.feature_code) / 3, where_b = static_cast<int>(found.feature_code) % 3;
-    CHECK(found.slide_count_a == (where_a == 2 ? 1 : 0));
-    CHECK(found.slide_count_b == (where_b == 2 ? 1 : 0));
-    CHECK(found.edge_a == Vec3(e.a1 - e.a0));
-    CHECK(found.edge_b == Vec3(e.b1 - e.b0));
-    if (where_a < 2) CHECK_NEAR(found.point_a, where_a == 0 ? e.a0 : e.a1, kRounding);
-    if (where_b < 2) CHECK_NEAR(found.point_b, where_b == 0 ? e.b0 : e.b1, kRounding);
+    CHECK(found.a.slide_count == (where_a == 2 ? 1 : 0));
+    CHECK(found.b.slide_count == (where_b == 2 ? 1 : 0));
+    CHECK(found.a.edge == Vec3(e.a1 - e.a0));
+    CHECK(found.b.edge == Vec3(e.b1 - e.b0));
+    if (where_a < 2) CHECK_NEAR(found.a.point, where_a == 0 ? e.a0 : e.a1, kRounding);
+    if (where_b < 2) CHECK_NEAR(found.b.point, where_b == 0 ? e.b0 : e.b1, kRounding);
 }
 
 }  // namespace
@@ -115,7 +115,7 @@ TEST(vertex_polygon_agrees_with_search) {
         const Vec3 x = random_vec3(random, 2.0);
         const ClosestPoints found = closest(x, p);
         check_vertex_polygon(x, p, found);
-        ++cases_hit[found.slide_count_b];
+        ++cases_hit[found.b.slide_count];
     }
     for (const int cases : cases_hit) CHECK(cases >= 20);
 }
@@ -135,7 +135,7 @@ TEST(vertex_polygon_in_degenerate_positions) {
         CHECK(closest(center, p).distance() <= kRounding);
         CHECK_NEAR(closest(Vec3(p[0] + 0.3 * n), p).distance(), 0.3, kRounding);
         CHECK(closest(Vec3(center + 0.2 * n), p).feature_code == 0);
-        CHECK(closest(beside, p).slide_count_b == 1);
+        CHECK(closest(beside, p).b.slide_count == 1);
     }
 }
 
@@ -144,7 +144,7 @@ TEST(polygons_without_area_are_their_boundary) {
     for (int k = 0; k < 40; ++k) {
         const Vec3 a = random_vec3(random), b = random_vec3(random), x = random_vec3(random, 2.0);
         CHECK_NEAR(closest(x, {a}).distance(), (x - a).norm(), kRounding);
-        CHECK(closest(x, {a}).slide_count_b == 0);
+        CHECK(closest(x, {a}).b.slide_count == 0);
         CHECK_NEAR(closest(x, {a, b}).distance(), point_segment(x, a, b), kRounding);
         const Vec3 corners[3] = {a, b, a};
         CHECK(polygon_normal(corners, 3).isZero(0.0));
@@ -176,8 +176,8 @@ TEST(edge_edge_agrees_with_search) {
                             turned = closest({e.a1, e.a0, e.b0, e.b1});
         CHECK_NEAR(swapped.distance(), found.distance(), kRounding);
         CHECK_NEAR(turned.distance(), found.distance(), kRounding);
-        CHECK_NEAR(swapped.point_a, found.point_b, 1e-9);  // conditioned by the angle of the edges
-        ++cases_hit[found.slide_count_a + found.slide_count_b];
+        CHECK_NEAR(swapped.a.point, found.b.point, 1e-9);  // conditioned by the angle of the edges
+        ++cases_hit[found.a.slide_count + found.b.slide_count];
     }
     for (const int cases : cases_hit) CHECK(cases >= 30);
 }
@@ -236,7 +236,7 @@ TEST(nearly_parallel_edges_keep_their_distance) {
 
 TEST(points_on_the_border_of_a_feature_are_told_apart_from_rounding) {
     const std::vector<Vec3> square = {{0, 0, 0}, {0.5, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};  // one vertex on a side
-    const auto counts = [](const ClosestPoints& found) { return std::pair(found.slide_count_b, found.border_count_b); };
+    const auto counts = [](const ClosestPoints& found) { return std::pair(found.b.slide_count, found.b.border_count); };
     check::Random random(6);
     for (int k = 0; k < 50; ++k) {
         NOTE(k);
@@ -247,7 +247,7 @@ TEST(points_on_the_border_of_a_feature_are_told_apart_from_rounding) {
         const auto found = [&](double x, double y, double z) { return closest(R * Vec3(x, y, z) + t, p); };
         CHECK(counts(found(0.3, 0.4, 0.2)) == std::pair(2, 0));
         CHECK(counts(found(0.3, 0.0, 0.2)) == std::pair(2, 1));
-        CHECK_NEAR(found(0.3, 0.0, 0.2).edge_b.normalized().cross(R.col(0)), Vec3::Zero(), kRounding);
+        CHECK_NEAR(found(0.3, 0.0, 0.2).b.edge.normalized().cross(R.col(0)), Vec3::Zero(), kRounding);
         CHECK(counts(found(0.5, 0.0, 0.2)) == std::pair(2, 1));  // a vertex there changes nothing
         CHECK(counts(found(1.0, 0.0, 0.2)) == std::pair(2, 2));
         CHECK(counts(found(0.3, -0.2, 0.2)) == std::pair(1, 0));
@@ -255,13 +255,13 @@ TEST(points_on_the_border_of_a_feature_are_told_apart_from_rounding) {
         CHECK(counts(found(1.0, -0.2, 0.2)) == std::pair(1, 1));
         CHECK(counts(found(1.2, 0.0, 0.2)) == std::pair(1, 1));
         CHECK(counts(found(1.2, -0.2, 0.2)) == std::pair(0, 0));
-        CHECK_NEAR(found(1.0, 0.0, 0.2).point_b, Vec3(R.col(0) + t), 1e-9);
+        CHECK_NEAR(found(1.0, 0.0, 0.2).b.point, Vec3(R.col(0) + t), 1e-9);
         const EdgePair crossed{
             R * Vec3(0, 0, 1) + t, R * Vec3(1, 0, 1) + t, R * Vec3(1, -1, 0) + t, R * Vec3(1, 1, 0) + t};
         const ClosestPoints of_edges = closest(crossed);
-        CHECK(of_edges.slide_count_a == 1);
-        CHECK(of_edges.border_count_a == 1);
-        CHECK(of_edges.slide_count_b == 1);
-        CHECK(of_edges.border_count_b == 0);
+        CHECK(of_edges.a.slide_count == 1);
+        CHECK(of_edges.a.border_count == 1);
+        CHECK(of_edges.b.slide_count == 1);
+        CHECK(of_edges.b.border_count == 0);
     }
 }

@@ -25,14 +25,13 @@ struct Scene {
     ZonePoint point, trial;
     ContactCoverage coverage;
     BlockSystem system;
-    HardContacts hard;
     std::optional<ZonePath> path;
     std::optional<ModelDirection> direction;
     Coordinates targets;
 
     Scene() {
         model.thickness = kThickness;
-        start_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
     }
     void add_box(const Pose& pose, const Vec6& target) {
         const Vec3 half = Vec3::Constant(kHalf);
@@ -66,7 +65,7 @@ struct Scene {
     void start() {
         targets.assign_zero(zone.bodies.size(), 0);
         point.y = targets;
-        path.emplace(zone, passive, hard, point, trial, coverage, system);
+        path.emplace(zone, passive, point, trial, coverage, system);
         path->set_to_targets(targets);
         path->list_contacts(targets);
         evaluate(zone, point);
@@ -113,15 +112,14 @@ struct Reference {
         const Placement at{point.y, point.poses, point.nodes};
         for (std::size_t k = 0; k < zone.contacts.size(); ++k) {
             const ZoneContact& contact = zone.contacts[k];
-            const double rest = contact.range.rest, compression = rest - geometries[k].distance;
+            const double rest = contact.law.range.rest, compression = rest - geometries[k].distance;
             if (geometries[k].sine_sq == 0.0) continue;
             ContactRow row = make_row(zone, contact, geometries[k], at, point.y, rest);
             row.contact = static_cast<int>(k);
-            row.range = rest - contact.range.floor;
-            const double pushes =
-                contact_potential(compression, rest - contact.range.pole, contact.stiffness.value).force;
+            row.range = rest - contact.law.range.floor;
+            const double pushes = normal_force(contact.law, geometries[k].distance).force;
             row.stiffness = edge_mollifier(geometries[k].sine_sq).value *
-                            (compression > 0.0 ? pushes / compression : contact.stiffness.value);
+                            (compression > 0.0 ? pushes / compression : contact.law.stiffness.value);
             if (compression > 0.0) add_row(row, row.stiffness * compression, model.gradient);
             model.rows.push_back(row);
         }

@@ -19,14 +19,14 @@ Model model() {
 /// `tag` tells contacts apart.
 Contact contact(int a, int b, int tag) { return {a, b, ContactType::vertex_patch, tag, -1}; }
 
-TouchingZones zones_of(const std::vector<std::vector<Contact>>& groups, bool with_hard, bool one_zone) {
-    std::vector<HardContact> hard;
-    for (int tag = 0; tag < 10; ++tag) hard.push_back({0.5 * tag, 1.0 * tag});
+TouchingZones zones_of(const std::vector<std::vector<Contact>>& groups, bool with_exact, bool one_zone) {
+    std::vector<ExactContact> exact;
+    for (int tag = 0; tag < 10; ++tag) exact.push_back({0.5 * tag, 1.0 * tag});
     std::vector<ContactList> lists;
     for (const std::vector<Contact>& group : groups)
-        lists.push_back({group.data(), hard.data(), static_cast<int>(group.size())});
+        lists.push_back({group.data(), exact.data(), static_cast<int>(group.size())});
     TouchingZones zones;
-    ZoneFinder().find(model(), {0, 1, 3, 4, 5, 6, 7}, lists, with_hard, one_zone, zones);
+    ZoneFinder().find(model(), {0, 1, 3, 4, 5, 6, 7}, lists, with_exact, one_zone, zones);
     return zones;
 }
 
@@ -50,17 +50,17 @@ TEST(zones_are_of_what_touches) {
     CHECK(zones.cloth_end == Ints({0, 0, 1, 2}));
     CHECK(tags(zones) == Ints({0, 3, 4, 1, 2}));
     CHECK(zones.contact_end == Ints({3, 4, 5, 5}));
-    CHECK(zones.hard.empty());
+    CHECK(zones.exact.empty());
 }
 
 TEST(multipliers_go_with_their_contacts) {
     const TouchingZones zones =
         zones_of({{contact(3, kGround, 0), contact(1, 5, 1), contact(3, kGround, 2)}}, true, false);
     CHECK(tags(zones) == Ints({1, 0, 2}));
-    CHECK(zones.hard.size() == 3);
+    CHECK(zones.exact.size() == 3);
     for (std::size_t k = 0; k < 3; ++k) {
-        CHECK(zones.hard[k].shift == 0.5 * tags(zones)[k]);
-        CHECK(zones.hard[k].compliance == 1.0 * tags(zones)[k]);
+        CHECK(zones.exact[k].shift == 0.5 * tags(zones)[k]);
+        CHECK(zones.exact[k].compliance == 1.0 * tags(zones)[k]);
     }
 }
 
@@ -76,10 +76,10 @@ TEST(what_a_finder_held_before_does_not_show) {
     ZoneFinder finder;
     TouchingZones zones;
     const Contact first = contact(0, 1, 0), second = contact(4, kGround, 1);
-    const HardContact hard{0.0, 1.0};
-    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&first, &hard, 1}}, true, false, zones);
-    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&second, &hard, 1}}, false, false, zones);
+    const ExactContact exact{0.0, 1.0};
+    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&first, &exact, 1}}, true, false, zones);
+    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&second, &exact, 1}}, false, false, zones);
     CHECK(zones.bodies == Ints({4}));
     CHECK(zones.count() == 3);
-    CHECK(zones.hard.empty());
+    CHECK(zones.exact.empty());
 }

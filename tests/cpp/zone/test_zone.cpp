@@ -4,7 +4,9 @@
 #include <utility>
 
 #include "fixtures.hpp"
+#include "zone/chart.hpp"
 #include "zone/contact_row.hpp"
+#include "zone/contacts.hpp"
 
 using namespace diffsim;
 using fixtures::dense;
@@ -33,24 +35,20 @@ Model near_bodies() {
 }
 
 void add_contact(Zone& zone, int a, int b, ContactType type, int feature_a, int feature_b) {
-    ZoneContact contact;
-    contact.contact = {a, b, type, feature_a, feature_b};
-    contact.a = a;
-    contact.b = b;
-    contact.pair = -1;
-    for (int k = 0; k < static_cast<int>(zone.pairs.size()); ++k)
-        if (zone.pairs[k] == std::pair(std::min(a, b), std::max(a, b))) contact.pair = k;
-    contact.range = contact_range(kThickness, kThickness);
-    contact.stiffness = {10.0, 0.0, 0.0};
-    zone.contacts.push_back(contact);
-    list_feature_vertices(zone, contact);
+    ContactSet& set = zone.contacts;
+    if (set.append({a, b, type, feature_a, feature_b}, {a, -1}, {b, -1}, false)) {
+        set.laws.push_back({contact_range(kThickness, kThickness), {10.0, 0.0, 0.0}});
+        for (int k = 0; k < static_cast<int>(set.blocks.size()); ++k)
+            if (set.blocks[k] == std::pair(std::min(a, b), std::max(a, b))) set.pairs.back().block = k;
+    }
+    list_feature_vertices(zone, set[set.size() - 1]);
 }
 
 /// Every pair of features of bodies of which one yields. The order of a and b alternates.
 void add_all_contacts(Zone& zone) {
     const int count = zone.body_count(), dynamic = zone.dynamic_count;
     for (int i = 0; i < dynamic; ++i)
-        for (int j = i + 1; j < dynamic; ++j) zone.pairs.emplace_back(i, j);
+        for (int j = i + 1; j < dynamic; ++j) zone.contacts.blocks.emplace_back(i, j);
     for (int i = 0; i < dynamic; ++i) {
         for (int v : zone.mesh(i).active_vertices) add_contact(zone, i, kGround, ContactType::vertex_patch, v, -1);
         for (int j = i + 1; j < count; ++j) {
@@ -71,10 +69,10 @@ void add_all_contacts(Zone& zone) {
 
 /// A zone at coordinates turned by up to 2 rad, where its bodies are near each other: the start lies that much before.
 Zone random_zone(const Model& model, check::Random& random, Coordinates& y) {
+    static const std::vector<ClothParameters> no_cloth;
     Zone zone;
-    zone.model = &model;
+    make_zone(zone, model, no_cloth, kDefaultCompliance, 0.01, Vec3::Zero());
     zone.dynamic_count = 3;
-    zone.ground_height = model.ground.height;
     y = Coordinates();
     const Vec3 places[5] = {{-0.8, 0, -0.4}, {0.8, 0.1, -0.3}, {0, 0, 0.95}, {0, 1.35, 0}, {0, -1.2, 0}};
     for (int i = 0; i < 5; ++i) {
@@ -224,8 +222,7 @@ TEST(dropped_curvature_leaves_mass_and_rows) {
             const bool ground = contact.contact.with_ground();
             const Vec3 center_b = ground ? Vec3(Vec3::Zero()) : point.poses[contact.b].t;
             const auto d = contact_derivatives(
-                active.geometry, contact.range, contact.stiffness.value, BodySide{point.poses[contact.a].t},
-                BodySide{center_b}, true, false);
+                active.geometry, contact.law, BodySide{point.poses[contact.a].t}, BodySide{center_b}, true, false);
             VectorX row = VectorX::Zero(18);
             if (contact.a < 3)
                 row.segment<6>(6 * contact.a) = chart_jacobian(y.bodies[contact.a]).transpose() * d.row.head<6>();

@@ -3,7 +3,10 @@
 #include <algorithm>
 
 #include "cloth_fixtures.hpp"
+#include "zone/chart.hpp"
 #include "zone/contact_row.hpp"
+#include "zone/contacts.hpp"
+#include "zone/sides_of.hpp"
 
 using namespace diffsim;
 using fixtures::dense;
@@ -44,11 +47,7 @@ struct Case {
 Case random_case(const Room& room, check::Random& random) {
     Case c;
     Zone& zone = c.zone;
-    zone.model = &room.model;
-    zone.dt = kDt;
-    zone.compliance = 0.01;
-    zone.ground_height = room.model.ground.height;
-    zone.cloth_parameters = &room.materials;
+    make_zone(zone, room.model, room.materials, 0.01, kDt, Vec3::Zero());
     Vec6 turned;
     turned << random.uniform(0.2, 2.0) * fixtures::random_direction(random), random_vec3(random, 0.3);
     const Mat3 R = exp_rotation(random_vec3(random, 0.2));
@@ -83,7 +82,7 @@ Case random_case(const Room& room, check::Random& random) {
     ContactCoverage coverage;
     collect_contacts(zone, passive, begin, end, coverage);
     c.y = end;
-    for (ZoneContact& contact : zone.contacts) contact.stiffness = {10.0, 0.0, 0.0};
+    for (ContactLaw& law : zone.contacts.laws) law.stiffness = {10.0, 0.0, 0.0};
     return c;
 }
 
@@ -125,7 +124,7 @@ bool is_stable(const Zone& zone, const Coordinates& y) {
     const ZonePoint here = point_at(zone, y, VectorX::Zero(size));
     if (here.energy == kInfinity) return false;
     for (const ActiveContact& active : here.active) {
-        const ContactRange& range = zone.contacts[active.index].range;
+        const ContactRange& range = zone.contacts.law(active.index).range;
         if (active.geometry.distance < range.pole + 0.15 * (range.rest - range.pole)) return false;
     }
     for (Eigen::Index i = 0; i < size; ++i)
@@ -269,30 +268,25 @@ TEST(dropped_curvature_leaves_mass_elasticity_and_rows) {
                 twist << (at - point.poses[static_cast<std::size_t>(body)].t).cross(normal), normal;
                 row.head<6>() += chart_jacobian(y.bodies[0]).transpose() * twist;
             };
-            const auto add_cloth = [&](bool of_a, const Vec3& normal) {
-                const Surface surface = of_a ? surface_a(zone, contact, point.poses, point.nodes)
-                                             : surface_b(zone, contact, point.poses, point.nodes);
-                const Vec3 weights = cloth_side(contact.contact, active.geometry, surface, of_a).weights;
-                const std::array<int, 3> nodes = feature_nodes(zone, contact, of_a);
+            const auto add_cloth = [&](const SideOfCloth& side, const ClosestPoint& closest, const Vec3& normal) {
+                const Surface surface = side.surface(point.poses, point.nodes);
+                const Vec3 weights = cloth_side(closest, normal, side.feature(), surface).weights;
+                const std::array<int, 3> nodes = side.nodes();
                 for (int k = 0; k < 3; ++k)
                     if (nodes[static_cast<std::size_t>(k)] >= 0)
                         row.segment<3>(6 + 3 * nodes[static_cast<std::size_t>(k)]) += weights[k] * normal;
             };
+            const auto add = [&](const auto& side, const ClosestPoint& closest, const Vec3& normal) {
+                using Side = std::decay_t<decltype(side)>;
+                if constexpr (std::is_same_v<Side, SideOfBody>) add_body(side.body(), closest.point, normal);
+                if constexpr (std::is_same_v<Side, SideOfCloth>) add_cloth(side, closest, normal);
+            };
             const ContactGeometry& g = active.geometry;
-            if (contact.cloth_a >= 0)
-                add_cloth(true, g.normal);
-            else
-                add_body(contact.a, g.closest.point_a, g.normal);
-            if (!contact.contact.with_ground()) {
-                if (contact.cloth_b >= 0)
-                    add_cloth(false, -g.normal);
-                else
-                    add_body(contact.b, g.closest.point_b, -g.normal);
-            }
-            double stiffness =
-                contact_potential(
-                    contact.range.rest - g.distance, contact.range.rest - contact.range.pole, contact.stiffness.value)
-                    .stiffness;
+            with_sides(zone, contact, [&](const auto& a, const auto& b) {
+                add(a, g.closest.a, g.normal);
+                add(b, g.closest.b, -g.normal);
+            });
+            double stiffness = normal_force(contact.law, g.distance).stiffness;
             if (g.sine_sq < kParallelLimit) stiffness *= edge_mollifier(g.sine_sq).value;
             expected += stiffness * row(rows) * row(rows).transpose();
         }
@@ -430,11 +424,12 @@ TEST(patterns_hold_what_elasticity_and_contacts_couple) {
     for (int k : contacts) {
         const ZoneContact& contact = c.zone.contacts[k];
         std::vector<int> touched;
-        for (const bool of_a : {true, false}) {
-            if ((of_a ? contact.cloth_a : contact.cloth_b) < 0 || contact.contact.with_ground()) continue;
-            for (int node : feature_nodes(c.zone, contact, of_a))
-                if (node >= 0 && !c.zone.nodes[node].pinned) touched.push_back(node);
-        }
+        if (contact.contact.with_ground()) continue;
+        visit_movers(
+            c.zone, contact, [](int) {},
+            [&](int node) {
+                if (!c.zone.nodes[node].pinned) touched.push_back(node);
+            });
         for (int i : touched) {
             if (c.zone.yields(contact.a)) mixed.emplace_back(contact.a, i);
             for (int j : touched)

@@ -65,12 +65,7 @@ Vec6 random_motion(check::Random& random, double size) {
 Case random_case(const Room& room, check::Random& random, double motion) {
     Case c;
     Zone& zone = c.zone;
-    zone.model = &room.model;
-    zone.dt = 0.01;
-    zone.compliance = 1e-4;
-    zone.origin = random_vec3(random);
-    zone.ground_height = room.model.ground.height - zone.origin.z();
-    zone.cloth_parameters = &room.materials;
+    make_zone(zone, room.model, room.materials, kDefaultCompliance, 0.01, random_vec3(random));
     const auto pose = [&] { return Pose{random_rotation(random), random_vec3(random, 0.7) - zone.origin}; };
     for (int i = 0; i < 2; ++i) {
         zone.bodies.push_back(fixtures::zone_body(i, pose(), 1.0, 0.1 * Mat3::Identity()));
@@ -245,12 +240,12 @@ TEST(contacts_name_their_objects_and_blocks) {
             check_side(contact.contact.object_a, contact.a, contact.cloth_a);
             check_side(contact.contact.object_b, contact.b, contact.cloth_b);
             const bool two_bodies = zone.yields(contact.a) && zone.yields(contact.b);
-            CHECK((contact.pair >= 0) == two_bodies);
+            CHECK((contact.block >= 0) == two_bodies);
             if (two_bodies)
                 CHECK(
-                    zone.pairs[contact.pair] ==
+                    zone.contacts.blocks[contact.block] ==
                     std::pair(std::min(contact.a, contact.b), std::max(contact.a, contact.b)));
-            CHECK(contact.range.rest == contact_margins(room.model, contact.contact));
+            CHECK(contact.law.range.rest == contact_margins(room.model, contact.contact));
             cases_hit += contact.cloth_b >= 0 ? 1 : 0;
         }
     }
@@ -291,7 +286,7 @@ TEST(pairs_left_out_have_not_come_near) {
             for (std::size_t i = 0; i < all.active.size(); ++i) CHECK(some.active[i].index == all.active[i].index);
             for (std::size_t i = 0; i < all.distances.size(); ++i) {
                 const bool known = some.distances[i] == all.distances[i];
-                CHECK((known || some.distances[i] > c.zone.contacts[i].range.rest));
+                CHECK((known || some.distances[i] > c.zone.contacts.law(i).range.rest));
                 CHECK(some.distances[i] <= all.distances[i] + 1e-15);
                 (known ? looked_at : left_out) += 1;
             }
@@ -324,7 +319,7 @@ TEST(an_allowed_step_keeps_cloth_above_its_floor) {
         evaluate(c.zone, point);
         bool apart = true;
         for (std::size_t i = 0; i < c.zone.contacts.size(); ++i)
-            apart = apart && point.distances[i] > c.zone.contacts[i].range.floor;
+            apart = apart && point.distances[i] > c.zone.contacts.law(i).range.floor;
         if (!apart) continue;
         std::vector<Impact> impacts;
         const double step = allowed_step(c.zone, point, c.end, &impacts);
@@ -365,7 +360,7 @@ TEST(contacts_with_a_driven_body_are_listed_for_all_its_way) {
         model.bodies.push_back(fixtures::body(fixtures::box(Vec3(0.3, 0.2, 0.1)), 0.5 * kThickness, kind));
     std::vector<ClothParameters> materials;
     Zone zone;
-    start_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+    make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
     zone.bodies.push_back(fixtures::zone_body(0, Pose(), 1.0, Mat3::Identity()));
     zone.dynamic_count = 1;
     const Vec6 target = -0.4 * Vec6::Unit(3);  // and so ends half the thickness from the other

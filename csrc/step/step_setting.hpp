@@ -1,0 +1,28 @@
+#pragma once
+
+#include <vector>
+
+#include "model/model.hpp"
+
+/// What the schemes of bodies and cloths are given beside states and controls, and the gradients that they add to.
+namespace diffsim {
+
+struct StepSetting {
+    const Model& model;
+    const Parameters& parameters;
+    double dt;  ///< [s]
+};
+
+/// d(loss)/d(Parameters).
+struct ParameterGradient {
+    std::vector<double> mass;
+    std::vector<Mat3> inertia;
+    Vec3 gravity = Vec3::Zero();
+    std::vector<ClothParameters> cloths;
+};
+
+/// Numbers whose squares are larger count as overflown, be it on the way or in a state: what is computed from smaller ones
+/// is finite, and so it is where single precision is asked for.
+inline constexpr double kLargestSquare = 1e76;
+
+}  // namespace diffsim

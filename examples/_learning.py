@@ -1,0 +1,265 @@
+"""What the examples of learned control share: a controller trained through the physics, DDPG beside it, and curves.
+
+Both play the same `Task`, one episode after the other, with the same network: 50 and 200 rectified linear units, a
+tangent at the end. Through the physics there is one update per episode, by the gradient of its loss, the squared
+distance from the target at the end over that at the start. DDPG, of stable-baselines3, gets as reward of every action
+how much nearer the object came, which adds up to the same; it makes an update per action.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from _stage import FloatArray, save_figure
+from torch import Tensor, nn
+from tqdm import tqdm
+
+import diffsim as ds
+
+HIDDEN = (50, 200)
+CLIP = 1.0  # of the norm of a gradient
+TESTS = 32  # episodes nothing was trained on
+AVERAGE = 10  # episodes a point of a curve is the mean of
+
+
+class Controller(nn.Module):
+    """From observations (B, n) to actions (B, m) between -1 and 1."""
+
+    def __init__(self, inputs: int, outputs: int, seed: int) -> None:
+        super().__init__()
+        torch.manual_seed(seed)
+        a, b = HIDDEN
+        layers = nn.Linear(inputs, a), nn.ReLU(), nn.Linear(a, b), nn.ReLU(), nn.Linear(b, outputs), nn.Tanh()
+        self.layers = nn.Sequential(*layers).double()
+        with torch.no_grad():
+            self.layers[-2].weight.mul_(0.1)  # at first it hardly moves
+            self.layers[-2].bias.zero_()
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.layers(observation)
+
+
+@dataclass
+class Curve:
+    """Of one seed: the distance left at the end of each episode, over that at its start, and when that was known."""
+
+    seed: int
+    left: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)  # of the processor
+    tests: FloatArray = field(default_factory=lambda: np.empty(0))  # the same in the test episodes, after training
+
+
+@dataclass
+class Learning:
+    name: str
+    curves: list[Curve] = field(default_factory=list)
+    controllers: list[Any] = field(default_factory=list)  # one per seed, by the gradient
+    failed_episodes: int = 0  # that had a step that did not converge
+
+    @property
+    def tests(self) -> FloatArray:
+        """Mean distance left in the test episodes, one per seed."""
+        return np.array([float(curve.tests.mean()) for curve in self.curves])
+
+
+Distance = Callable[[Any], Tensor]  # from a Moment to the distance from the target, over that at the start, (B,)
+
+
+def play(task: Any, act: Callable[[Tensor], Tensor], moment: Any) -> tuple[list[Any], bool]:
+    """The moments of whole episodes, the start among them, and whether all steps converged."""
+    moments, converged = [moment], True
+    for _ in range(task.steps):
+        moments.append(task.step(moments[-1], act(task.observation(moments[-1]))))
+        converged = converged and task.simulator.info.converged
+    return moments, converged
+
+
+def test_starts(task: Any) -> Any:
+    return task.start(*(np.random.default_rng(10_000 + i) for i in range(TESTS)))
+
+
+def test(task: Any, act: Callable[[Tensor], Tensor], left: Distance) -> FloatArray:
+    """What is left of the distance in episodes nothing was trained on."""
+    with torch.no_grad():
+        return np.asarray(left(play(task, act, test_starts(task))[0][-1]).numpy())
+
+
+# ---- through the physics ---------------------------------------------------------------------------------------------
+
+
+def by_gradient(task: Any, left: Distance, seeds: Sequence[int], episodes: int, rate: float) -> Learning:
+    learning = Learning("through the physics")
+    first = task.observation(task.start(np.random.default_rng(0)))
+    for seed in seeds:
+        controller = Controller(first.shape[1], task.action_space.shape[0], seed)
+        optimiser = torch.optim.Adam(controller.parameters(), lr=rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, episodes)
+        curve, generator, begin = Curve(seed), np.random.default_rng(seed), time.process_time()
+        for _ in tqdm(range(episodes), desc=f"{learning.name}, seed {seed}", unit="episode", leave=False):
+            moments, converged = play(task, controller, task.start(generator))
+            learning.failed_episodes += not converged
+            loss = left(moments[-1]).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(controller.parameters(), CLIP)
+            optimiser.step()
+            schedule.step()
+            curve.left.append(loss.item() ** 0.5)
+            curve.seconds.append(time.process_time() - begin)
+        curve.tests = test(task, controller, left)
+        learning.curves.append(curve)
+        learning.controllers.append(controller)
+    return learning
+
+
+# ---- beside it -------------------------------------------------------------------------------------------------------
+
+
+def by_ddpg(task: Any, left: Distance, seeds: Sequence[int], episodes: int) -> Learning | None:
+    """None where stable-baselines3 is missing, which is said."""
+    if importlib.util.find_spec("stable_baselines3") is None:
+        print('stable-baselines3 is not installed (pip install "mesh-diffsim[rl]"): DDPG is left out')
+        return None
+    from stable_baselines3 import DDPG
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.noise import NormalActionNoise
+
+    class Record(BaseCallback):
+        def __init__(self, curve: Curve, bar: Any) -> None:
+            super().__init__()
+            self.curve, self.bar, self.begin = curve, bar, time.process_time()
+
+        def _on_step(self) -> bool:
+            for info in self.locals["infos"]:
+                if "episode" in info:  # by the Monitor stable-baselines3 puts around an environment
+                    self.curve.left.append(1.0 - info["episode"]["r"])
+                    self.curve.seconds.append(time.process_time() - self.begin)
+                    self.bar.update()
+            return True
+
+    learning, size = Learning("DDPG"), task.action_space.shape[0]
+    for seed in seeds:
+        curve = Curve(seed)
+        noise = NormalActionNoise(np.zeros(size), 0.2 * np.ones(size))
+        network = {"net_arch": list(HIDDEN)}
+        env = ds.interop.gymnasium.Env(task)
+        start = 5 * task.steps  # five episodes of random actions before the first update
+        model = DDPG("MlpPolicy", env, seed=seed, action_noise=noise, policy_kwargs=network, learning_starts=start)
+        with tqdm(total=episodes, desc=f"DDPG, seed {seed}", unit="episode", leave=False) as bar:
+            model.learn(episodes * task.steps, callback=Record(curve, bar))
+
+        def act(observation: Tensor, model: Any = model) -> Tensor:
+            return torch.from_numpy(
+                model.predict(observation.numpy().astype(np.float32), deterministic=True)[0]
+            ).double()
+
+        curve.tests = test(task, act, left)
+        learning.curves.append(curve)
+    return learning
+
+
+# ---- checks and pictures ---------------------------------------------------------------------------------------------
+
+
+def gradient_error(task: Any, controller: Controller, left: Distance) -> float:
+    """Of the loss of one episode along a direction of the controller's weights, relative to central differences."""
+    weights = list(controller.parameters())
+    generator = torch.Generator().manual_seed(0)
+    direction = [torch.randn(w.shape, generator=generator, dtype=w.dtype) for w in weights]
+
+    def loss() -> Tensor:
+        return left(play(task, controller, task.start(np.random.default_rng(99)))[0][-1]).square().mean()
+
+    gradient = torch.autograd.grad(loss(), weights)
+    expected = sum(float((g * d).sum()) for g, d in zip(gradient, direction))
+    values, nudge = [], 1e-7
+    with torch.no_grad():
+        for sign in (1.0, -2.0):  # there, and from there to the other side
+            for w, d in zip(weights, direction):
+                w.add_(d, alpha=sign * nudge)
+            values.append(float(loss()))
+        for w, d in zip(weights, direction):
+            w.add_(d, alpha=nudge)
+    assert expected != 0.0
+    return abs((values[0] - values[1]) / (2.0 * nudge) / expected - 1.0)
+
+
+def findings(
+    task: Any, left: Distance, ours: Learning, ddpg: Learning | None, reach: float, error: float
+) -> list[tuple[str, bool]]:
+    """What must hold, in words, and whether it does."""
+    listed = ", ".join(f"{100.0 * t:.1f}" for t in ours.tests)
+    results = [
+        (
+            f"at {TESTS} test targets the controllers leave {listed} % of the distance (at most {100.0 * reach:g})",
+            bool((ours.tests <= reach).all()),
+        )
+    ]
+    text = f"{ours.failed_episodes} episodes had a step that did not converge"
+    results.append((text, ours.failed_episodes == 0))
+    fresh = Controller(task.observation(test_starts(task)).shape[1], task.action_space.shape[0], 0)
+    for name, controller in (("first", fresh), ("learned", ours.controllers[0])):
+        found = gradient_error(task, controller, left)
+        text = f"gradient of an episode by the {name} controller: {found:.1e} off central differences"
+        results.append((text, found <= error))
+    if ddpg is not None:
+        listed = ", ".join(f"{100.0 * t:.0f}" for t in ddpg.tests)
+        text = f"DDPG leaves {listed} % of the distance after as many episodes"
+        results.append((text, bool(np.median(ddpg.tests) > np.median(ours.tests))))
+    return results
+
+
+def summary(learnings: Sequence[Learning]) -> dict[str, Any]:
+    """For a file of results."""
+    return {
+        learning.name: [
+            {
+                "seed": c.seed,
+                "left": [round(x, 5) for x in c.left],
+                "seconds": [round(x, 3) for x in c.seconds],
+                "tests": [round(float(x), 5) for x in c.tests],
+            }
+            for c in learning.curves
+        ]
+        for learning in learnings
+    }
+
+
+COLORS = {"through the physics": "#d9601a", "DDPG": "#7a4fa3"}
+
+
+def draw_curves(axes: Any, learning: Learning, over_seconds: bool) -> None:
+    """Mean over seeds and one standard deviation to both sides."""
+    kernel = np.ones(AVERAGE) / AVERAGE
+    smooth = [np.convolve(c.left, kernel, mode="valid") for c in learning.curves]
+    values, color = 100.0 * np.array(smooth), COLORS[learning.name]
+    x = np.arange(AVERAGE, AVERAGE + values.shape[1], dtype=float)
+    if over_seconds:
+        x = np.mean([c.seconds for c in learning.curves], axis=0)[AVERAGE - 1 :]
+    mean, deviation = values.mean(axis=0), values.std(axis=0)
+    axes.plot(x, mean, color=color, lw=1.8, label=learning.name)
+    axes.fill_between(x, np.maximum(mean - deviation, 0.3), mean + deviation, color=color, alpha=0.2, lw=0.0)
+
+
+def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], None]) -> None:
+    def fill(figure: Any) -> None:
+        scene, episodes, seconds = figure.subplots(1, 3)
+        draw_scene(scene)
+        for axes, over_seconds, label in ((episodes, False, "episodes"), (seconds, True, "seconds of the processor")):
+            for learning in learnings:
+                draw_curves(axes, learning, over_seconds)
+            axes.axhline(5.0, color="0.6", lw=1.0, ls="--")
+            axes.set(xlabel=label, ylabel="distance left at the end [%]", yscale="log", ylim=(0.5, 300.0))
+            axes.grid(True, alpha=0.3)
+        episodes.legend(frameon=False)
+        count = len(learnings[0].curves)
+        seconds.set_title(f"mean and standard deviation of {count} seeds", fontsize=10, color="0.2")
+
+    save_figure(path, fill, figsize=(13.0, 4.2))
