@@ -109,7 +109,7 @@ class Run:
         if in_mujoco:
             self.mujoco = ways_to_step(*frictionless(scene, self.start, dt=DT), steps)
 
-    def step_by_step(self, clock: Callable[[], float]) -> list[tuple[float, ds.ops.Info]]:
+    def step_by_step(self, clock: Callable[[], float]) -> list[tuple[float, ds.Info]]:
         """Seconds and statistics of every step."""
         found = []
         state = self.start

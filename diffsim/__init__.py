@@ -4,10 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from . import diagnostics, parameters, rotation, shapes
+from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from ._units import UnitsWarning
 from .contacts import Contacts
 from .materials import ClothMaterial
-from .ops import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from .scene import BodyHandle, ClothHandle, Scene
 from .simulator import Simulator
 from .state import Control, State

@@ -49,9 +49,9 @@ def check_number(
 
 def check_count(where: str, name: str, value: object) -> int:
     """A whole number, at least 1."""
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
+    if isinstance(value, bool) or not (isinstance(value, int) or hasattr(value, "__index__")):
         raise TypeError(message(where, name, "be a whole number", type(value).__name__))
-    count = int(value.__index__())
+    count = value if isinstance(value, int) else int(value.__index__())
     if count < 1:
         raise ValueError(message(where, name, "be at least 1", count))
     return count
@@ -115,7 +115,8 @@ def check_placing(where: str, name: str, value: Any, width: int, state: State) -
     tensor = check_float_tensor(where, name, value)
     if tensor.ndim == 0 or tensor.shape[-1] != width:
         raise ValueError(message(where, name, f"have shape (..., {width})", tuple(tensor.shape)))
-    if width == 4 and not torch._C._are_functorch_transforms_active():
+    looked_at = not (torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active())
+    if width == 4 and looked_at:
         length = torch.linalg.vector_norm(tensor.detach(), dim=-1)
         if not ((length > 1e-6) & length.isfinite()).all():
             raise ValueError(message(where, name, "be quaternions w, x, y, z other than zero", tensor.tolist()))

@@ -234,8 +234,8 @@ class Measurements(nn.Module):
                 Default: as it is.
         Returns: The state in its dtype, with the leading axes of state, position and orientation, broadcast.
         Raises: TypeError, ValueError for a state that is not one of this scene, a handle of another scene or of a
-            cloth, shapes that do not fit, a quaternion that is zero or not finite (inside a transform of torch.func the
-            next step finds it); IndexError for a body there is not.
+            cloth, shapes that do not fit, a quaternion that is zero or not finite (inside torch.func's transforms and
+            torch.compile the next step finds it); IndexError for a body there is not.
         Gradients: with respect to the state, the position and the orientation.
         """
         where = "place"

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from . import _core
+from . import _compiled, _core
 from ._check import (
     CLOTH_PARAMETERS,
     PARAMETERS,
@@ -32,11 +32,11 @@ from ._inputs import (
     state_from,
 )
 from ._measurements import Measurements
-from ._outcome import combined, failure_text, warn_of_failure, warn_of_fast_impacts
+from ._outcome import Info, SolverError, combined, failure_text, warn_of_failure, warn_of_fast_impacts
 from ._packed import PackedScene, core_model
 from ._progress import progress_bar
 from .contacts import Contacts, contacts_from
-from .ops import Info, RolloutCall, SolverError, rollout
+from .ops import RolloutCall, rollout
 from .scene import Scene
 from .state import Control, State
 
@@ -183,6 +183,7 @@ class Simulator(SceneIdentity, Measurements):
         self._object_names = (*p.names, *p.cloth_names)
         self._cloth_of_node = torch.from_numpy(np.repeat(np.arange(len(p.node_count)), p.node_count))
         self._separated: tuple[np.ndarray, ...] | None = None
+        self._number = _compiled.enlist(self)
 
     def __getstate__(self) -> dict[str, Any]:
         state = {**self.__dict__, "_info": self.info}
@@ -274,14 +275,16 @@ class Simulator(SceneIdentity, Measurements):
         """
         values = self._values("Simulator", parameters)
         inputs, single = None, False
-        if not self._node_count:
+        traced = torch.compiler.is_compiling()
+        if not self._node_count and not traced:
             inputs = plain_inputs(state, control, values, self._state_shapes, self._parameter_shapes)
         if inputs is None:  # anything but float64 tensors in the plainest shapes
             inputs, _, single = self._checked_inputs("Simulator", state, control, None, values)
+        if traced:
+            return state_from(_compiled.rollout(self._number, inputs, values, 1, single=single), state)
         if self._check:
-            self._check_unused_parameters(values)
-        threads = self._num_threads or torch.get_num_threads()
-        call = RolloutCall(self._model, self._options, 1, threads, single=single)
+            self._check_unread(values["friction"], values["restitution"])
+        call = self._make_call(1, single=single)
         outputs = rollout(call, *inputs)  # type: ignore[arg-type]
         result = state_from(outputs, state)
         self._finish([call.info], result)
@@ -337,42 +340,43 @@ class Simulator(SceneIdentity, Measurements):
             length = max(1, steps // _PROGRESS_UPDATES)
         values = self._values(where, parameters)
         inputs, has_time, single = self._checked_inputs(where, state, controls, steps, values)
-        if self._check:
-            self._check_unused_parameters(values)
-        threads = self._num_threads or torch.get_num_threads()
+        traced = torch.compiler.is_compiling()
+        if self._check and not traced:
+            self._check_unread(values["friction"], values["restitution"])
         now, driven, constant = inputs[:6], inputs[6:12], inputs[12:]
         segments, infos, signatures = [], [], []
-        with progress_bar(steps, progress) as advance:
+        with progress_bar(steps, progress and not traced) as advance:
             for start in range(0, steps, length):
                 count = min(length, steps - start)
-                call = RolloutCall(
-                    self._model,
-                    self._options,
-                    count,
-                    threads,
-                    controls_have_time=has_time,
-                    keep_time=True,
-                    keep_tape=checkpoint_every is None or steps <= every,
-                    want_signature=want_signature,
-                    first_step=start,
-                    single=single,
-                )
+                settings: dict[str, Any] = {
+                    "controls_have_time": has_time,
+                    "keep_time": True,
+                    "keep_tape": checkpoint_every is None or steps <= every,
+                    "first_step": start,
+                    "single": single,
+                }
                 part = driven
                 if has_time and count < steps:
                     part = tuple(None if t is None else t[start : start + count] for t in driven)
-                segment = rollout(call, *now, *part, *constant)  # type: ignore[arg-type]
+                given = (*now, *part, *constant)
+                if traced:
+                    segment = _compiled.rollout(self._number, given, values, count, **settings)
+                else:
+                    call = self._make_call(count, want_signature=want_signature, **settings)
+                    segment = rollout(call, *given)  # type: ignore[arg-type]
+                    infos.append(call.info)
+                    signatures.append(call.signature)
                 if start + count < steps:
                     # A view would keep the segment alive to the backward.
                     now = tuple(None if t is None else t[-1].clone() for t in segment)
                 segments.append(segment)
-                infos.append(call.info)
-                signatures.append(call.signature)
                 advance(count)
         outputs = segments[0]
         if len(segments) > 1:
             outputs = tuple(None if column[0] is None else torch.cat(column) for column in zip(*segments))
         result = state_from(outputs, state)
-        self._finish(infos, result)
+        if not traced:
+            self._finish(infos, result)
         return result, np.concatenate(signatures) if want_signature else None  # type: ignore[arg-type]
 
     def contacts(
@@ -424,9 +428,13 @@ class Simulator(SceneIdentity, Measurements):
         parameters = {name: (values[name], self._parameter_shapes[name]) for name in (*PARAMETERS, *CLOTH_PARAMETERS)}
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
-    def _check_unused_parameters(self, values: Mapping[str, Any]) -> None:
-        for name in ("friction", "restitution"):
-            check_unused(name, values[name], self._parameter_shapes[name], self._object_names)
+    def _make_call(self, steps: int, **settings: Any) -> RolloutCall:
+        threads = self._num_threads or torch.get_num_threads()
+        return RolloutCall(self._model, self._options, steps, threads, **settings)
+
+    def _check_unread(self, friction: Tensor, restitution: Tensor) -> None:
+        for name, value in (("friction", friction), ("restitution", restitution)):
+            check_unused(name, value, self._parameter_shapes[name], self._object_names)
 
     def _finish(self, segments: list[Any], result: State) -> None:
         """Keeps the statistics of the call, and warns or raises if a step did not converge."""
@@ -444,6 +452,12 @@ class Simulator(SceneIdentity, Measurements):
         if not self._warned:
             self._warned = True
             warn_of_failure(text)
+
+    def _finish_traced(self, info: Any, first_step: int, outputs: tuple[Tensor | None, ...]) -> None:
+        """The same where compiled code runs, which does so after each segment."""
+        before = self._info if first_step and isinstance(self._info, list) else []
+        names = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
+        self._finish([*before, info], State(**dict(zip(names, outputs))))  # type: ignore[arg-type]
 
 
 def _checked_iterations(count: int | None, coupling: str) -> int | None:

@@ -25,6 +25,7 @@ def test_the_pages_script_runs_and_its_gradients_arrive() -> None:
     assert not names["done"].all()
     assert torch.equal(names["state"].position[names["done"]][0], names["sim"].initial_state().position)
     assert len(names["end"]) == 4
+    assert names["velocity"].grad.any()
     # ω = t τ / (factor I): the gradient of each scene with respect to its factor is -ω.
     spin = names["trajectory"][-1].angular_velocity[:, 0, 2]
     torch.testing.assert_close(names["factor"].grad, -spin.detach(), rtol=1e-9, atol=0.0)
