@@ -137,7 +137,7 @@ def contacts_from(
 
 
 class _HardForce(torch.autograd.Function):
-    """The reaction of a hard contact, which does not follow from where the step ends: its distance is always the same."""
+    """The reaction of a hard contact: it does not follow from where the step ends, as its distance is always the same."""
 
     @staticmethod
     def forward(ctx: Any, force: Tensor) -> Tensor:
