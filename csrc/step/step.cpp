@@ -8,6 +8,7 @@
 #include "math/rotation.hpp"
 #include "step/body_step.hpp"
 #include "step/cloth_step.hpp"
+#include "step/driven_bodies.hpp"
 #include "step/group_step.hpp"
 
 namespace diffsim {
@@ -79,6 +80,7 @@ public:
         m_info.seconds_motion = seconds_since(clock);
         for (int attempt = 0;; ++attempt) {
             list_passive();
+            if (attempt == 0 && stop_at_static_bodies()) list_passive();
             group();
             m_info.seconds_broad_phase += seconds_since(clock);
             m_scratch.blocked.clear();
@@ -200,6 +202,23 @@ private:
             m_scratch.passive.bodies.push_back({i, start, m_scratch.y.bodies[i]});
         }
         m_scratch.passive.tree = build_box_tree(m_scratch.passive_boxes);
+    }
+
+    /// A driven body that a static one is in the way of goes as far as there is room. False if there is none.
+    bool stop_at_static_bodies() {
+        bool any = false;
+        for (const PassiveBody& driven : m_scratch.passive.bodies) {
+            if (driven.target.isZero(0.0)) continue;
+            const DriveStop stop = find_static_obstacle(m_model, m_scratch.passive, driven);
+            if (stop.obstacle == kNobody) continue;
+            m_scratch.y.bodies[driven.id] *= stop.part;
+            m_info.converged = false;
+            m_info.status = ZoneStatus::blocked;
+            fail(driven.id);
+            fail(stop.obstacle);
+            any = true;
+        }
+        return any;
     }
 
     void group() {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import warnings
 
 import pytest
 import torch
@@ -52,6 +53,47 @@ def test_a_squeeze_names_scene_step_and_what_is_squeezed() -> None:
     assert not sim.info.converged
     assert sim.info.scenes_converged.shape == ()
     assert [(f.scene, f.step) for f in sim.info.failures] == [(0, 0)]
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], ids=["into", "along"])
+def test_a_kinematic_body_stops_at_a_static_one_in_its_way(direction: tuple[float, float, float]) -> None:
+    scene = ds.Scene()
+    scene.add_body(ds.shapes.box((0.2, 0.2, 0.2)), kind="static", name="wall")
+    scene.add_body(
+        ds.shapes.box((0.2, 0.2, 0.2)),
+        kind="kinematic",
+        position=(-0.225, 0.0, 0.0),
+        velocity=direction,
+        name="ram",
+    )
+    scene.add_sphere(0.05, density=500.0, position=(0.0, 0.0, 2.0), name="bystander")
+    sim = ds.Simulator(scene, dt=0.01)
+    state, blocked = sim.initial_state(), []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        for k in range(6):
+            state = sim(state, ds.Control(body_velocity=state.velocity.new_tensor([[0.0] * 3, direction, [0.0] * 3])))
+            assert sim.info is not None
+            if not sim.info.converged:
+                blocked.append(k)
+                assert sim.info.failures[0].status == "blocked"
+                assert sim.info.failures[0].bodies == ("wall", "ram")
+    gap = -0.2 - float(state.position[1, 0])
+    if direction[0] == 0.0:
+        assert blocked == [] and gap == pytest.approx(0.025)
+    else:
+        assert blocked == [2, 3, 4, 5]
+        assert 0.0 < gap < 0.001
+
+
+def test_a_kinematic_body_built_into_a_static_one_moves_on() -> None:
+    scene = ds.Scene()
+    scene.add_body(ds.shapes.box((0.2, 0.2, 0.2)), kind="static", name="bearing")
+    scene.add_body(ds.shapes.box((1.0, 0.05, 0.05)), kind="kinematic", velocity=(1.0, 0.0, 0.0), name="shaft")
+    sim = ds.Simulator(scene, dt=0.01)
+    end = sim.rollout(sim.initial_state(), steps=20)[-1]
+    assert sim.info is not None and sim.info.converged
+    assert float(end.position[1, 0]) == pytest.approx(0.2)
 
 
 def test_a_squeeze_between_others_names_what_takes_part_and_no_one_else() -> None:
