@@ -250,7 +250,7 @@ def draw_curves(axes: Any, learning: Learning, over_seconds: bool) -> None:
 
 def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], None]) -> None:
     def fill(figure: Any) -> None:
-        scene, episodes, seconds = figure.subplots(1, 3)
+        scene, episodes, seconds = figure.subplots(1, 3, width_ratios=(1.3, 1.0, 1.0))
         draw_scene(scene)
         for axes, over_seconds, label in ((episodes, False, "episodes"), (seconds, True, "seconds of the processor")):
             for learning in learnings:
@@ -260,6 +260,7 @@ def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], 
             axes.grid(True, alpha=0.3)
         episodes.legend(frameon=False)
         count = len(learnings[0].curves)
-        seconds.set_title(f"mean and standard deviation of {count} seeds", fontsize=10, color="0.2")
+        title = f"mean and standard deviation of {count} seeds" if count > 1 else "one seed"
+        seconds.set_title(title, fontsize=10, color="0.2")
 
     save_figure(path, fill, figsize=(13.0, 4.2))

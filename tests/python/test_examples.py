@@ -135,6 +135,19 @@ def test_cloth_example_fails_where_it_should(
         assert any(text in line for line in wrong), wrong
 
 
+@pytest.mark.parametrize(
+    ("name", "holds"), [("estimate_mass", 7), ("mujoco_interop", 6), ("learn_sticks", 5), ("learn_cloth", 6)]
+)
+def test_application_passes(name: str, holds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mujoco" if name == "mujoco_interop" else "gymnasium", reason="pip install .[examples]")
+    assert load(name).main(["--quick", "--out", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "FAIL" not in output
+    assert output.count("ok  ") == holds
+    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    assert (tmp_path / f"{name}.json").stat().st_size > 100
+
+
 def test_trampoline_leaves_mujoco_out_where_it_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
