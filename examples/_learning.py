@@ -1,11 +1,11 @@
 """What the examples of learned control share: a controller trained through the physics, DDPG beside it, and curves.
 
 Both play the same `Task`, one episode after the other, with the same network: 50 and 200 rectified linear units, a
-tangent at the end. Through the physics there is one update per episode, by the gradient of its loss, the squared
-distance from the target at the end over that at the start. DDPG, of stable-baselines3 with its own defaults, gets as reward of every
-action how much nearer the object came, which adds up to the same; it makes an update per action. It is no rival at so few
-episodes: its actions run into their limits. A third of the rate and four times as many random episodes at first did not
-change that.
+tangent at the end. Through the physics there is one update per episode, by the gradient of its loss, the square of the
+distance from the target at the end over that at the start. DDPG, of stable-baselines3 with its own defaults, gets as
+reward of every action how much nearer the object came, which adds up to the same; it makes an update per action. It is
+no rival at so few episodes: its actions run into their limits. A third of the rate and four times as many random
+episodes at first did not change that.
 """
 
 from __future__ import annotations
