@@ -40,7 +40,7 @@ CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')
 demo: $(VENV)/.with-examples
 	$(BIN)/python examples/throw_bunny.py
 
-examples: $(VENV)/.with-examples
+examples: $(VENV)/.with-examples $(VENV)/.with-rl
 	@for script in $(sort $(wildcard examples/[a-z]*.py)); do echo $$script; $(BIN)/python $$script || exit 1; done
 
 test: test-cpp test-python

@@ -39,7 +39,7 @@ DENSITY, GRAVITY = 10.0, 1.0  # of the block [kg/m³], [m/s²]
 SPEED = 5.0  # of a stick at most [m/s]
 SIDE, UP, SPREAD = 1.0, 2.0, 0.05  # of the targets [m]
 
-EPISODES, QUICK_EPISODES = 200, 120
+EPISODES, QUICK_EPISODES = 100, 100
 SEEDS, RATE = 5, 3e-3
 REACH = 0.05  # of the distance that may be left
 GRADIENT_ERROR = 1e-4  # of an episode's gradient, relative
@@ -104,6 +104,8 @@ def build_task() -> tuple[Any, Any]:
     return task, distance_left
 
 
+APART = 5.5  # of the pictures of one motion [m]
+
 # ---- checks and picture ----------------------------------------------------------------------------------------------
 
 
@@ -120,15 +122,17 @@ def check(task: Any, left: Any, ours: Learning, ddpg: Learning | None) -> bool:
 def draw_scene(axes: Any, task: Any, ours: Learning) -> None:
     with torch.no_grad():
         moments, _ = play(task, ours.controllers[0], test_starts(task)[:1])
-    items, sim = [], task.simulator
-    for index in (0, STEPS // 2, STEPS):
-        state, shade = moments[index].state[0], 1.0 - 0.35 * (1.0 - index / STEPS)
-        items.append(Item(sim.mesh(state, 0), (0.93 * shade, 0.55 * shade, 0.25 * shade), 0.9))
-        items += [Item(sim.mesh(state, stick), (0.50 * shade, 0.66 * shade, 0.80 * shade)) for stick in (1, 2)]
-    camera = Camera(-75.0, 10.0)
-    draw_items(axes, items, camera, shadows=False, largest=0.5)
-    target = camera.project(moments[0].goal.numpy())[0]
-    axes.plot(*target[:2], marker="+", ms=15, mew=2.0, color="#0a7d33", zorder=4)
+    items, marks, sim = [], [], task.simulator
+    camera = Camera(-84.0, 9.0)
+    for place, index in enumerate((0, STEPS // 2, STEPS)):
+        shift = np.array([APART * place, 0.0, 0.0])
+        for body, color in enumerate(((0.93, 0.55, 0.25), (0.50, 0.66, 0.80), (0.50, 0.66, 0.80))):
+            mesh = sim.mesh(moments[index].state[0], body)
+            mesh.apply_translation(shift)
+            items.append(Item(mesh, color))
+        marks.append(camera.project(moments[0].goal.numpy()[0] + shift))
+    draw_items(axes, items, camera, shadows=False, largest=0.3)
+    axes.plot(*np.array(marks)[:, :2].T, "+", ms=12, mew=2.0, color="#0a7d33", zorder=4)
     axes.set_title("a test target, t = 0, 0.48 and 1 s", fontsize=10, color="0.2")
 
 

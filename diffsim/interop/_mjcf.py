@@ -113,6 +113,42 @@ def inertial(model: Any, root: int) -> Inertial:
     return Inertial(mass, center, about)
 
 
+# ---- overlaps --------------------------------------------------------------------------------------------------------
+
+_SWEEPS = 1000  # over all contacts; a stack of n bodies takes about n²
+
+
+def shifts_apart(model: Any, data: Any, room: float) -> FloatArray:
+    """By how much to move free bodies so that none of MuJoCo's contacts is nearer than `room`, shape (nbody, 3) [m].
+
+    Contact after contact is opened along its normal, by half from both sides or all from the one that is free, until
+    none is left to open.
+    """
+    copy = mujoco.MjData(model)
+    copy.qpos[:], copy.mocap_pos[:], copy.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+    mujoco.mj_fwdPosition(model, copy)
+    yields = np.where(model.body_dofnum > 0, 1.0, 0.0)
+    roots = model.body_weldid[model.geom_bodyid]
+    contacts = [
+        (int(roots[contact.geom1]), int(roots[contact.geom2]), contact.frame[:3].copy(), float(contact.dist) - room)
+        for contact in copy.contact
+    ]
+    contacts = [contact for contact in contacts if yields[contact[0]] + yields[contact[1]] > 0.0]
+    shifts = np.zeros((model.nbody, 3))
+    for _ in range(_SWEEPS):
+        moved = False
+        for a, b, normal, gap in contacts:  # the normal points from a to b
+            missing = -(gap + normal @ (shifts[b] - shifts[a]))
+            if missing > 0.01 * room:
+                push = missing / (yields[a] + yields[b]) * normal
+                shifts[a] -= yields[a] * push
+                shifts[b] += yields[b] * push
+                moved = True
+        if not moved:
+            break
+    return shifts
+
+
 # ---- surfaces --------------------------------------------------------------------------------------------------------
 
 SEGMENTS = 32  # corners of the polygon that stands for a circle

@@ -44,6 +44,7 @@ from ._mjcf import Group, Inertial
 
 __all__ = ["from_mjdata", "load", "to_mjdata"]
 
+_ROOM = 0.1  # of the thickness, to which MuJoCo's contacts are opened: rounding must not let meshes cross
 _SAME_CENTER = 1e-9  # of the centres of mass of a simulator and a model, relative to their size
 
 
@@ -88,18 +89,23 @@ def load(source: str | os.PathLike[str] | mujoco.MjModel) -> Scene:
     return scene
 
 
-def from_mjdata(sim: Simulator, model: mujoco.MjModel, data: mujoco.MjData) -> State:
+def from_mjdata(sim: Simulator, model: mujoco.MjModel, data: mujoco.MjData, *, separate: bool = False) -> State:
     """The state of MuJoCo's data: of all free and mocap bodies; what else is in the simulator's scene is as there.
 
-    MuJoCo's contacts are soft, so that bodies at rest overlap a little; a step refuses a state with meshes that cross.
+    MuJoCo's contacts are soft, so that bodies at rest overlap a little, and a step refuses a state with meshes that
+    cross: for such data there is `separate`.
 
     Args:
         sim: Of the scene `load` made of this model, to which more may have been added.
         model: As compiled by MuJoCo.
         data: Its qpos, qvel, mocap_pos and mocap_quat are read, so that it need not be forwarded. Mocap bodies have no
             velocity in MuJoCo, and get none.
-    Returns: New float64 tensors, without a batch axis. From here to `to_mjdata` and back nothing changes but rounding.
-    Raises: ValueError for a simulator without a body of this model, or with one whose centre of mass is elsewhere.
+        separate: Move free bodies out of each other, and out of what does not move, along the normals of MuJoCo's
+            contacts; then as `Simulator.separate`. Velocities stay.
+    Returns: New float64 tensors, without a batch axis. From here to `to_mjdata` and back nothing changes but rounding,
+        unless bodies had to be separated.
+    Raises: ValueError for a simulator without a body of this model, or with one whose centre of mass is elsewhere; as
+        `Simulator.separate`.
     Gradients: none.
     """
     state = sim.initial_state().to(torch.float64)
@@ -119,7 +125,12 @@ def from_mjdata(sim: Simulator, model: mujoco.MjModel, data: mujoco.MjData) -> S
         spin[body] = turn @ data.qvel[moves + 3 : moves + 6]
         position[body] = data.qpos[at : at + 3] + arm
         velocity[body] = data.qvel[moves : moves + 3] + np.cross(spin[body], arm)
-    return state
+    if not separate:
+        return state
+    shifts = _mjcf.shifts_apart(model, data, room=_ROOM * sim.thickness)
+    for body, group, _ in _matched("from_mjdata", sim, model):
+        position[body] += shifts[group.root]
+    return sim.separate(state)
 
 
 def to_mjdata(sim: Simulator, state: State, model: mujoco.MjModel, data: mujoco.MjData) -> None:

@@ -135,6 +135,65 @@ def test_cloth_example_fails_where_it_should(
         assert any(text in line for line in wrong), wrong
 
 
+@pytest.mark.parametrize(
+    ("name", "holds"), [("estimate_mass", 7), ("mujoco_interop", 6), ("learn_sticks", 5), ("learn_cloth", 6)]
+)
+def test_application_passes(name: str, holds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mujoco" if name == "mujoco_interop" else "gymnasium", reason="pip install .[examples]")
+    assert load(name).main(["--quick", "--out", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "FAIL" not in output
+    assert output.count("ok  ") == holds
+    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    assert (tmp_path / f"{name}.json").stat().st_size > 100
+
+
+def test_mujoco_interop_fails_where_the_layer_has_another_mass(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mujoco", reason="pip install .[examples]")
+    module = load("mujoco_interop")
+    made = module.Task.__init__
+
+    def make(task: object, seed: int) -> None:
+        made(task, seed)
+        with torch.no_grad():
+            task.sim.mass[task.cubes[1]] *= 3.0  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(module.Task, "__init__", make)
+    assert module.main(["--no-picture"]) == 1
+    assert "FAIL  gradient through contact" in capsys.readouterr().out
+
+
+def test_estimate_mass_fails_where_velocities_are_damped(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = load("estimate_mass")
+    forward = module.Rollout.forward
+
+    def damped(self: object, state: ds.State, control: ds.Control | None) -> ds.State:
+        trajectory = forward(self, state, control)
+        return trajectory.replace(velocity=0.673 * trajectory.velocity)
+
+    monkeypatch.setattr(module.Rollout, "forward", damped)
+    descent = module.descend(1.0)
+    assert descent.masses[-1] == pytest.approx(5.46, abs=0.01)  # as the paper has it
+    recording = module.Recording()
+    jacobian = torch.eye(5, dtype=torch.float64).repeat(43, 1)
+    fit = module.Fit(torch.zeros(5, dtype=torch.float64), jacobian, module.NOISE, [])
+    five = torch.ones(5, dtype=torch.float64)
+    assert not module.check(descent, recording, fit, module.Coverage(40, 38 * five, five))
+    wrong = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL ")]
+    assert len(wrong) == 2
+    assert all("collision: " in line for line in wrong)
+
+
+def test_learn_sticks_fails_without_training(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gymnasium", reason="pip install .[examples]")
+    assert load("learn_sticks").main(["--quick", "--episodes", "3", "--no-picture"]) == 1
+    assert "FAIL  at 32 test targets" in capsys.readouterr().out
+
+
 def test_trampoline_leaves_mujoco_out_where_it_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

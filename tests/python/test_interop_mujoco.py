@@ -137,6 +137,28 @@ def test_flight_without_spin_is_mujocos_euler_step_by_step() -> None:
         np.testing.assert_allclose(state.position[0], data.qpos[:3], atol=1e-14)
 
 
+def test_a_stack_at_rest_in_mujoco_is_taken_apart_before_a_step() -> None:
+    boxes = "".join(
+        f'<body pos="0 0 {0.1 + 0.2 * i}"><freejoint/><geom type="box" size=".1 .1 .1" mass="{mass}"/></body>'
+        for i, mass in enumerate((1, 5, 2, 20))
+    )
+    model, data, sim = loaded(f'<mujoco><worldbody><geom type="plane" size="0 0 1"/>{boxes}</worldbody></mujoco>')
+    mujoco.mj_step(model, data, 500)
+    deep = min(contact.dist for contact in data.contact)
+    assert deep < -1e-4
+    with pytest.raises(ValueError, match=r"cross|in the ground"):
+        sim(ds.interop.mujoco.from_mjdata(sim, model, data))
+    before = data.qpos.copy()
+    state = ds.interop.mujoco.from_mjdata(sim, model, data, separate=True)
+    assert (data.qpos == before).all()
+    raised = state.position[:, 2] - ds.interop.mujoco.from_mjdata(sim, model, data).position[:, 2]
+    assert (raised > 0.0).all()
+    assert raised.max() < 10.0 * (sim.thickness - deep)
+    assert sim.rollout(state, None, 20)[-1].velocity.abs().max() < 0.02
+    assert sim.info is not None
+    assert sim.info.converged
+
+
 @pytest.mark.parametrize(
     ("geom", "vertices"),
     [
