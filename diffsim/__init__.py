@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from . import diagnostics, rotation, shapes
+from . import diagnostics, rotation, shapes, viewer
 from ._units import UnitsWarning
 from .materials import ClothMaterial
 from .ops import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
@@ -28,6 +28,7 @@ __all__ = [
     "diagnostics",
     "rotation",
     "shapes",
+    "viewer",
 ]
 
 

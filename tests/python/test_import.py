@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-LAZY_MODULES = ("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco")
+LAZY_MODULES = ("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco", "k3d", "imageio_ffmpeg", "PIL", "rerun")
 
 
 def modules_loaded_by(statement: str) -> set[str]:
