@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -178,7 +179,7 @@ def picture(
     camera: Camera | None = None,
     colors: Mapping[Any, Sequence[float]] | None = None,
     axes: Any = None,
-    size: tuple[float, float] = (8.0, 5.0),
+    size: tuple[float, float] = (6.4, 4.0),
 ) -> Any:
     """Several moments of a trajectory in one picture, the earlier ones paler.
 
@@ -225,8 +226,19 @@ def picture(
     if path is not None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110, bbox_inches="tight", pad_inches=0.08)
+        _save(figure, path, None)
+    figure._repr_png_ = lambda: _png(figure)  # notebooks ask for it; pyplot, which draws there else, is not involved
     return figure
+
+
+def _save(figure: Any, target: Any, kind: str | None) -> None:
+    figure.savefig(target, format=kind, dpi=110, bbox_inches="tight", pad_inches=0.08)
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    _save(figure, buffer, "png")
+    return buffer.getvalue()
 
 
 @dataclass(frozen=True)

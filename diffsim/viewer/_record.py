@@ -15,8 +15,10 @@ from ..simulator import Simulator
 from ..state import State
 from ._draw import Camera
 from ._film import write_film
+from ._gltf import write_glb
 from ._html import html_page, make_plot
 from ._recording import IntArray, as_trajectory, make_recording
+from ._rerun import write_rrd
 
 _FILMS = (".mp4", ".gif", ".webp")
 _SUFFIXES = (".html", ".glb", *_FILMS, ".rrd")
@@ -40,6 +42,8 @@ def record(
     """Write what happened in a simulation into a file, of a kind that its suffix says.
 
     * ``.html``: one file for any browser, without network, to play, to scrub through and to turn around (by k3d).
+    * ``.glb``: an animated glTF 2.0 file for Blender, Unity, web pages and others (needs no package).
+    * ``.rrd``: for the Rerun viewer (``pip install 'mesh-diffsim[rerun]'``).
     * ``.mp4``, ``.gif``, ``.webp``: a film (by matplotlib; what interlocks may be drawn in the wrong order).
 
     Spheres and capsules are shown with facets, everything else with its mesh; margins and thickness are not drawn.
@@ -49,9 +53,10 @@ def record(
         trajectory: One state, or states with a leading time axis and no batch axis, or a sequence of single states,
             `sim.dt` apart; the first is shown at time 0. `Simulator.rollout` leaves out the state it starts from.
         path: File to write; folders above it are made.
-        speed: How many seconds of the simulation pass in one of the recording.
+        speed: How many seconds of the simulation pass in one of the recording (.rrd: it is set in the player).
         fps: Frames per second of the recording. Each shows the nearest state. Default: 25, in .gif and .webp 20; all
-            states, but at most 60, where the player goes smoothly from one to the next (.html).
+            states, but at most 60, where the player goes smoothly from one to the next (.html, .glb) or picks
+            its own (.rrd).
         colors: Red, green and blue from 0 to 1 by name or handle, of objects that shall not have the default colour.
         camera: Where a film is seen from, and a page at first. Default: `Camera()`.
         size: Of a film [pixels].
@@ -79,6 +84,10 @@ def record(
         shown = len(frames) > _LONG if progress is None else progress
         with progress_bar(len(frames), shown, path.name, "frame") as tell:
             write_film(recording, path, rate, camera, (width, height), tell)
+    elif path.suffix == ".glb":
+        write_glb(recording, path, speed)
+    elif path.suffix == ".rrd":
+        write_rrd(recording, path)
     else:
         path.write_text(html_page(recording, camera, speed, where), encoding="utf-8")
     return path

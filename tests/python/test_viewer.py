@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
+import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,6 +128,66 @@ def pixels(png: bytes) -> np.ndarray:
     return np.asarray(image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 
 
+def gltf(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The document of a .glb file, and its accessors."""
+    raw = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack("<IIIII", raw[:20])
+    assert (magic, version, size, kind) == (0x46546C67, 2, len(raw), 0x4E4F534A)
+    document, data = json.loads(raw[20 : 20 + length]), raw[28 + length :]
+    arrays = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        values = np.frombuffer(
+            data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]],
+            np.uint32 if accessor["componentType"] == 5125 else np.float32,
+        )
+        arrays.append(values.reshape(accessor["count"], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]))
+    return document, arrays
+
+
+def test_gltf_moves_as_the_simulation(fall: tuple[ds.Simulator, ds.State], tmp_path: Path) -> None:
+    sim, trajectory = fall
+    path = ds.viewer.record(sim, trajectory, tmp_path / "fall.glb", fps=25)
+    document, arrays = gltf(path)
+    nodes = {node["name"]: index for index, node in enumerate(document["nodes"])}
+    (animation,) = document["animations"]
+    samplers = animation["samplers"]
+    tracks = {(c["target"]["node"], c["target"]["path"]): samplers[c["sampler"]] for c in animation["channels"]}
+    shown = [*range(0, 19, 2), 19]
+    track = tracks[nodes["box"], "translation"]
+    np.testing.assert_allclose(arrays[track["output"]], trajectory.position[shown, 0], atol=1e-6)
+    np.testing.assert_allclose(arrays[track["input"]][:, 0], sim.dt * np.array(shown), atol=1e-6)
+    turns = arrays[tracks[nodes["box"], "rotation"]["output"]][:, [3, 0, 1, 2]]
+    np.testing.assert_allclose(np.abs((turns * trajectory.orientation[shown, 0].numpy()).sum(1)), 1.0, atol=1e-6)
+
+    (primitive,) = document["meshes"][document["nodes"][nodes["sheet"]]["mesh"]]["primitives"]
+    weights = arrays[tracks[nodes["sheet"], "weights"]["output"]].reshape(len(shown), -1)
+    targets = np.stack([arrays[target["POSITION"]] for target in primitive["targets"]])
+    nodes_shown = arrays[primitive["attributes"]["POSITION"]] + np.tensordot(weights, targets, axes=1)
+    np.testing.assert_allclose(nodes_shown, trajectory.node_position[shown], atol=1e-6)
+
+
+def test_gltf_is_read_by_trimesh(fall: tuple[ds.Simulator, ds.State], tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    sim, trajectory = fall
+    loaded = trimesh.load(ds.viewer.record(sim, trajectory, tmp_path / "fall.glb"), force="scene")
+    assert set(loaded.geometry) == {"box", "ball", "block", "sheet", "ground"}
+    box = loaded.geometry["box"].copy()
+    box.apply_transform(loaded.graph["box"][0])
+    # y points up there.
+    expected = sim.mesh(trajectory[0], 0).bounds[:, [0, 2, 1]] * [1, 1, -1]
+    np.testing.assert_allclose(box.bounds, np.sort(expected, axis=0), atol=1e-5)
+
+
+def test_rerun_recording_has_every_object(fall: tuple[ds.Simulator, ds.State], tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="pip install 'mesh-diffsim[rerun]'")
+    sim, trajectory = fall
+    raw = ds.viewer.record(sim, trajectory, tmp_path / "fall.rrd").read_bytes()
+    assert raw[:4] == b"RRF2"
+    for name in (b"world/box", b"world/ball", b"world/block", b"world/sheet", b"world/ground"):
+        assert name in raw
+
+
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_moving_picture_moves(fall: tuple[ds.Simulator, ds.State], tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("matplotlib", reason="pip install 'mesh-diffsim[viewer]'")
@@ -173,3 +236,4 @@ def test_picture_shows_float32_states(fall: tuple[ds.Simulator, ds.State]) -> No
     sim, trajectory = fall
     figure = ds.viewer.picture(sim, trajectory[-1].to(torch.float32))
     assert len(figure.axes[0].collections) == 5  # four shadows, and what casts them
+    assert pixels(figure._repr_png_()).std() > 10  # as notebooks show it
