@@ -1,5 +1,6 @@
 # make demo       throw the bunny (examples/throw_bunny.py)
 # make examples   all examples, each of which checks itself; pictures in out/
+# make notebooks  run examples/notebooks/*.py and write them to .ipynb with their outputs
 # make test       C++ and Python tests, the latter against the installed package
 # make check      after a change: what it touches is compiled and tested, the rest and all that is slow is left out
 # make sanitize   C++ tests in a Debug build with address and undefined-behaviour sanitizers
@@ -34,7 +35,7 @@ SOURCES := pyproject.toml CMakeLists.txt \
            $(shell find csrc diffsim -type f ! -path '*/__pycache__/*' ! -name '_core*.so')
 CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')
 
-.PHONY: demo examples test test-cpp test-python check sanitize lint format docs bench clean
+.PHONY: demo examples notebooks test test-cpp test-python check sanitize lint format docs bench clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.with-examples
@@ -42,6 +43,9 @@ demo: $(VENV)/.with-examples
 
 examples: $(VENV)/.with-examples $(VENV)/.with-rl
 	@for script in $(sort $(wildcard examples/[a-z]*.py)); do echo $$script; $(BIN)/python $$script || exit 1; done
+
+notebooks: $(VENV)/.with-notebooks
+	$(BIN)/python examples/notebooks/execute.py
 
 test: test-cpp test-python
 

@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from . import diagnostics, parameters, rotation, shapes
+from . import diagnostics, parameters, rotation, shapes, viewer
 from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from ._units import UnitsWarning
 from .contacts import Contacts
@@ -32,6 +32,7 @@ __all__ = [
     "parameters",
     "rotation",
     "shapes",
+    "viewer",
 ]
 
 

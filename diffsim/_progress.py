@@ -1,4 +1,4 @@
-"""The progress bar of a rollout: tqdm's, or a plain line where tqdm is missing."""
+"""The progress bar of a rollout or a recording: tqdm's, or a plain line where tqdm is missing."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def progress_bar(steps: int, shown: bool) -> Iterator[Callable[[int], object]]:
+def progress_bar(
+    steps: int, shown: bool, name: str = "rollout", unit: str = "step"
+) -> Iterator[Callable[[int], object]]:
     """Gives a function that is told how many more steps are done."""
     if not shown:
         yield lambda count: None
@@ -21,10 +23,10 @@ def progress_bar(steps: int, shown: bool) -> Iterator[Callable[[int], object]]:
         def advance(count: int) -> None:
             nonlocal done
             done += count
-            sys.stderr.write(f"\rrollout: step {done} of {steps}" + ("\n" if done == steps else ""))
+            sys.stderr.write(f"\r{name}: {unit} {done} of {steps}" + ("\n" if done == steps else ""))
             sys.stderr.flush()
 
         yield advance
         return
-    with tqdm(total=steps, desc="rollout", unit="step") as bar:
+    with tqdm(total=steps, desc=name, unit=unit) as bar:
         yield bar.update

@@ -137,7 +137,7 @@ def contacts_from(
 
 
 class _HardForce(torch.autograd.Function):
-    """The reaction of a hard contact: it does not follow from where the step ends, as its distance is always the same."""
+    """The reaction of a hard contact: where the step ends does not tell it, as the distance is always the same."""
 
     @staticmethod
     def forward(ctx: Any, force: Tensor) -> Tensor:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -124,88 +122,6 @@ def point_triangle_distance(point: FloatArray, triangles: FloatArray) -> FloatAr
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------
-
-LIGHT = np.array([-0.35, -0.55, 1.0]) / np.linalg.norm([-0.35, -0.55, 1.0])
-GROUND, SHADOW = np.array([0.955, 0.955, 0.965]), np.array([0.86, 0.86, 0.885])
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Orthographic, looking at the origin from these angles [degrees]."""
-
-    azimuth: float
-    elevation: float
-
-    def project(self, points: Any) -> Any:
-        """Points to (right, up, towards the camera)."""
-        ca, sa, ce, se = (f(math.radians(x)) for x in (self.azimuth, self.elevation) for f in (math.cos, math.sin))
-        view = np.array([[-sa, ca, 0.0], [-ca * se, -sa * se, ce], [ca * ce, sa * ce, se]])
-        return np.asarray(points) @ view.T
-
-
-@dataclass(frozen=True)
-class Item:
-    """A mesh to draw. Cloth (`two_sided`) is seen from both sides; whatever else is closed."""
-
-    mesh: Any
-    color: Sequence[float]
-    alpha: float = 1.0
-    two_sided: bool = False
-    edges: float = 0.0  # width of the lines between triangles, 0 for none
-
-
-def draw_items(axes: Any, items: Sequence[Item], camera: Camera, shadows: bool = True, largest: float = 0.04) -> None:
-    """Triangles of all meshes, flat shaded, far ones first; triangles longer than `largest` [m] are split for that."""
-    from matplotlib.collections import PolyCollection
-
-    subdivide: Any = trimesh.remesh.subdivide_to_size
-    triangles: list[Any] = []
-    colors: list[Any] = []
-    lines: list[Any] = []
-    for item in items:
-        mesh = item.mesh
-        if shadows:
-            fall = mesh.vertices - mesh.vertices[:, 2:] * LIGHT / LIGHT[2]
-            axes.add_collection(
-                PolyCollection(camera.project(fall)[mesh.faces][..., :2], facecolors=SHADOW, edgecolors=SHADOW, lw=0.3)
-            )
-        vertices, faces = (mesh.vertices, mesh.faces)
-        if not item.two_sided:
-            vertices, faces = subdivide(vertices, faces, largest)
-        corners = vertices[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        facing = camera.project(normals)[:, 2]
-        if item.two_sided:
-            normals[facing < 0.0] *= -1.0
-        brightness = 0.45 + 0.4 * np.clip(normals @ LIGHT, 0.0, 1.0) + 0.15 * np.clip(normals[:, 2], 0.0, 1.0)
-        visible = np.ones(len(faces), bool) if item.two_sided else facing > 0.0
-        shade = np.clip(brightness[visible, None] * np.asarray(item.color)[:3] * 1.08, 0.0, 1.0)
-        alphas = np.full((len(shade), 1), item.alpha)
-        triangles.append(camera.project(corners)[visible])
-        colors.append(np.concatenate([shade, alphas], axis=1))
-        line = np.concatenate([shade * (0.75 if item.edges else 1.0), alphas], axis=1)
-        lines.append(line if item.edges or item.alpha == 1.0 else np.concatenate([shade, 0.0 * alphas], axis=1))
-    triangle, color, line = np.concatenate(triangles), np.concatenate(colors), np.concatenate(lines)
-    order: Any = np.argsort(triangle[..., 2].mean(axis=1), kind="stable")
-    axes.add_collection(
-        PolyCollection(triangle[order][..., :2], facecolors=color[order], edgecolors=line[order], lw=0.25, zorder=2)
-    )
-    flat = triangle[..., :2].reshape(-1, 2)
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    pad = 0.06 * (high - low).max()
-    axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad), aspect="equal", facecolor=GROUND)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def ball_mesh(radius: float, centre: Any) -> Any:
-    """For pictures: spheres have no mesh of their own."""
-    mesh: Any = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    mesh.apply_translation(np.asarray(centre))
-    return mesh
 
 
 def save_figure(path: Path, draw: Callable[[Any], None], **layout: Any) -> None:

@@ -25,10 +25,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import Camera, FloatArray, Item, Judge, draw_items, report, save_figure
+from _stage import FloatArray, Judge, report, save_figure
 from tqdm import tqdm
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 SLOTS = 15  # dominoes, evenly spaced on the circle; the cloth hangs between the last and the first
 RADIUS = 0.3  # of the circle [m]
@@ -252,7 +253,7 @@ def draw(run: Run, path: Path) -> None:
                     color = colormap(0.15 + 0.6 * run.dominoes.index(body) / len(run.dominoes))[:3]
                 items.append(Item(run.sim.mesh(run.states[step], body), color))
             sheet = run.sim.mesh(run.states[step], len(run.sim.body_names))
-            items.append(Item(sheet, (0.45, 0.62, 0.80), two_sided=True, edges=0.2))
+            items.append(Item(sheet, (0.45, 0.62, 0.80), two_sided=True, edges=True))
             draw_items(axes, items, camera)
             axes.set(xlim=(-0.35, 0.72), ylim=(-0.16, 0.52))
             axes.set_title(f"{title}, t = {step * dt:.2f} s", fontsize=10, color="0.2")

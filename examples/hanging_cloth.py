@@ -28,11 +28,12 @@ from typing import Any
 import cma  # type: ignore[import-untyped]
 import numpy as np
 import torch
-from _stage import Camera, FloatArray, Item, Judge, draw_items, report, save_figure
+from _stage import FloatArray, Judge, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 LENGTH, WIDTH, HEIGHT = 0.8, 0.1, 1.0  # of the strip, and of its clamp over the ground [m]
 NODES = (33, 5)  # along and across
@@ -296,7 +297,7 @@ def draw(problem: Problem, searches: Sequence[Search], path: Path) -> None:
         items = []
         for logs, color in ((guess, (0.80, 0.80, 0.82)), (searches[0].best, (0.50, 0.66, 0.80))):
             mesh = strip.sim.mesh(strip.run(logs)[-1].detach(), 0)
-            items.append(Item(mesh, color, alpha=0.9, two_sided=True, edges=0.2))
+            items.append(Item(mesh, color, alpha=0.9, two_sided=True, edges=True))
         draw_items(left, items, camera, shadows=False)
         dots = camera.project(problem.observed.numpy())
         left.plot(dots[:, 0], dots[:, 1], ".", ms=2.5, color="#b3261e", zorder=5)

@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from _stage import Camera, FloatArray, Item, Judge, draw_items, load_figure, report, save_figure
+from _stage import FloatArray, Judge, load_figure, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 FACES, SIZE, DENSITY = 400, 0.2, 300.0  # of a figurine: faces at most, longest side [m], [kg/m³]
 APART = 0.26  # of the figurines' centres [m]
@@ -194,8 +195,8 @@ def draw(run: Run, path: Path) -> None:
             state = run.states[step]
             items = [Item(run.sim.mesh(state, body), COLORS[body]) for body in range(len(run.sim.body_names))]
             cloth = run.sim.mesh(state, len(run.sim.body_names))
-            items.append(Item(cloth, (0.45, 0.62, 0.80), alpha=0.55, two_sided=True, edges=0.2))
-            draw_items(axes, items, Camera(-62.0, 18.0), largest=0.03)
+            items.append(Item(cloth, (0.45, 0.62, 0.80), alpha=0.55, two_sided=True, edges=True))
+            draw_items(axes, items, Camera(-62.0, 18.0), split=0.03)
             axes.set(xlim=(-0.72, 0.72), ylim=(-0.3, 1.06))
             axes.set_title(f"t = {step * dt:.2f} s", fontsize=10, color="0.2")
 

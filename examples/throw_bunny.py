@@ -28,11 +28,12 @@ import fcl
 import numpy as np
 import torch
 import trimesh
-from _stage import Camera, FloatArray, Item, draw_items, load_figure, report, save_figure
+from _stage import FloatArray, load_figure, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 FACES = 1000  # of the bunny, after decimation
 SIZE = 0.1  # longest side of its bounding box [m]

@@ -28,10 +28,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _stage import Camera, FloatArray, Item, Judge, draw_items, report, save_figure
+from _stage import FloatArray, Judge, report, save_figure
 from tqdm import tqdm
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 NODES = 21  # of the sheet along a side
 SIDE, HEIGHT = 1.0, 1.0  # of the sheet [m]
@@ -269,7 +270,7 @@ def draw(run: Run, others: Sequence[Peer], path: Path) -> None:
         for row, (index, title) in enumerate(((lowest, "lowest"), (apex, "back up"))):
             axes = figure.add_subplot(grid[row, 0])
             items = [
-                Item(run.sim.mesh(run.states[index], 1), (0.50, 0.66, 0.80), alpha=0.93, two_sided=True, edges=0.25),
+                Item(run.sim.mesh(run.states[index], 1), (0.50, 0.66, 0.80), alpha=0.93, two_sided=True, edges=True),
                 Item(run.sim.mesh(run.states[index], 0), (0.93, 0.55, 0.25)),
             ]
             draw_items(axes, items, camera, shadows=False)

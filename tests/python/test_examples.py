@@ -104,6 +104,7 @@ def test_throw_bunny_says_in_a_line_that_there_is_no_such_mesh(
         ("dominoes", [], 7),
         ("trampoline", ["--quick"], 7),
         ("hanging_cloth", [], 10),
+        ("marble_inverse", ["--quick"], 7),
     ],
 )
 def test_cloth_example_passes(
@@ -124,6 +125,7 @@ def test_cloth_example_passes(
         ("dominoes", ["--no-sills", "--duration", "1.0"], ("dominoes fall", "the last domino does not reach")),
         ("dominoes", ["--missing", "3", "--duration", "1.0"], ("dominoes fall", "the last domino does not reach")),
         ("trampoline", ["--quick", "--dt", "0.04"], ("comes up to",)),  # such steps take its energy away
+        ("marble_inverse", ["--quick", "--iterations", "1"], ("after 1 iterations descent", "the marble ends")),
     ],
 )
 def test_cloth_example_fails_where_it_should(

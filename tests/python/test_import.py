@@ -5,7 +5,10 @@ import sys
 
 import pytest
 
-LAZY_MODULES = ("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco", "gymnasium")
+LAZY_MODULES = (
+    *("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco", "gymnasium"),
+    *("k3d", "imageio_ffmpeg", "PIL", "rerun"),
+)
 
 
 def modules_loaded_by(statement: str) -> set[str]:
