@@ -1,9 +1,9 @@
 """Fingerprints of states and gradients: what a change that should change nothing is held to.
 
-Eight scenes in which all of the step takes part: free fall and impacts, a heap, a stack at rest, hard contacts,
-a driven body, cloth with a body on it, cloth in split coupling, and a batch. One CSV line each, with the first digits of
-the SHA-256 of the final state's bits, and of those of the gradient of a loss on it. They are equal on one machine for as
-long as no sum changes its order; nothing is timed.
+Eight scenes in which all of the step takes part: free fall and impacts, a heap, a stack at rest, hard contacts, a
+driven body, cloth with a body on it, cloth in split coupling, and a batch. One CSV line each, with the first digits of
+the SHA-256 of the final state's bits and of those of a loss's gradient. They are equal on one machine for as long as no
+sum changes its order; nothing is timed.
 """
 
 from __future__ import annotations
