@@ -434,11 +434,19 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
             }
             if (free == 1.0) break;
         }
+        way.squeezes = !driven && way.free < 1.0 && asks_for_too_much();
+        if (way.squeezes) break;
     }
     y_end = best;
     for (int i = static_cast<int>(best.bodies.size()); i < m_zone.body_count(); ++i)  // joined on the way
         y_end.bodies.push_back(m_zone.bodies[i].target);
     return way;
+}
+
+/// Whether the model's solution is beyond some contact's floor: all that can yield has yielded, and there is no room.
+bool ModelDirection::asks_for_too_much() const {
+    const auto is_beyond = [](const ContactRow& row) { return row.force > row.stiffness * row.range; };
+    return std::any_of(m_model.rows.begin(), m_model.rows.end(), is_beyond);
 }
 
 // --- damping ----------------------------------------------------------------------------------------------------------

@@ -24,6 +24,8 @@ public:
         bool found = false;    ///< false where rounding spoils the model's matrix
         double free = 0.0;     ///< how much of the way to y_end is free for all that is listed
         int newton_steps = 0;  ///< factorizations
+        /// Driven bodies leave no room even where the rows are those of where the way ends: something is squeezed there.
+        bool squeezes = false;
     };
     /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts is
     /// made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then, none is found:
@@ -63,6 +65,7 @@ private:
     void add_row(const NearContact& near, const ContactGeometry& geometry);
     void add_row_at_impact(const NearContact& near, double toi, const Coordinates& y_end);
     void linearise_at(const Coordinates& y_end, const std::vector<Impact>& impacts);
+    bool asks_for_too_much() const;
     void shorten_blocked(const std::vector<Impact>& impacts, Coordinates& p) const;
 
     const Zone& m_zone;

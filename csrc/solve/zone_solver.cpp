@@ -19,6 +19,7 @@ constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
 constexpr int kMaxStalls = 3;             // steps in a row that get a driven body nowhere
 constexpr double kStall = 1e-3;           // of the way that is left
+constexpr double kSqueeze = 0.1;          // of the way that is left: where something is squeezed, less is no progress
 constexpr double kExactTolerance = 1e-9;  // on an exact contact's distance, of its range
 constexpr int kMaxMultiplierRounds = 50;
 constexpr double kNearSolution = 1e-4;  // residual below which the plain Newton step ends it
@@ -381,6 +382,7 @@ private:
         if (!way.found) return ModelStep::near;
         const double step = m_path.covered_step(m_w.y_end, way.free);
         if (!driven) {
+            if (way.squeezes && step < kSqueeze) return ModelStep::blocked;
             const DriveProgress progress = advance_drives(step, stalls);
             if (progress == DriveProgress::blocked) return ModelStep::blocked;
             if (progress == DriveProgress::moved) accept_trial();
