@@ -17,8 +17,8 @@ bool ContactSet::append(const Contact& contact, ZoneObject a, ZoneObject b, bool
                        pairs.back().object_b == contact.object_b && pairs.back().own_laws == own_law;
     if (!known)
         pairs.push_back(
-            {contact.object_a, contact.object_b, a, b, static_cast<int>(contacts.size()),
-             static_cast<int>(laws.size()), own_law});
+            {contact.object_a, contact.object_b, a, b, static_cast<int>(contacts.size()), static_cast<int>(laws.size()),
+             own_law});
     contacts.push_back({{contact.type, contact.feature_a, contact.feature_b}, static_cast<int>(pairs.size()) - 1});
     return !known || own_law;
 }
