@@ -29,6 +29,7 @@ COLUMNS = {
     "memory": ("case", "cubes", "peak_mb", "tape_bytes_per_body_step"),
     "overhead": ("run", "nothing_forward_us", "backward_ratio"),
     "relative_scale": ("scale", "forward_backward_s", "memory_mb", "most_iterations"),
+    "work_precision": ("scene", "what", "name", "dt_s", "time_ms", "error"),
     "threads": ("cubes", "threads", "forward_s", "backward_speedup"),
 }
 POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times

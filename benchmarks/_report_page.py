@@ -1,0 +1,149 @@
+"""The work-precision report as pages: Markdown and HTML from one list of sections, plots as SVG."""
+
+from __future__ import annotations
+
+import datetime
+import html
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from _common import draw_curves, installed_version, processor, save_plot
+
+FLOOR = 1e-14  # errors below are drawn there
+Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
+
+
+@dataclass
+class Panel:
+    """Curves over one axis, of which some are ours."""
+
+    xlabel: str
+    ylabel: str
+    curves: Curves
+    ours: frozenset[str] = frozenset()
+
+
+@dataclass
+class Section:
+    name: str
+    title: str
+    text: list[str]
+    panels: list[Panel] = field(default_factory=list)
+    tables: list[Mapping[str, Any]] = field(default_factory=list)  # of columns and rows
+
+
+# ---- plots and what they say -----------------------------------------------------------------------------------------
+
+
+def draw(section: Section, figure: Any) -> None:
+    rows = math.ceil(len(section.panels) / 2)
+    for axes, panel in zip(figure.subplots(rows, min(2, len(section.panels)), squeeze=False).flat, section.panels):
+        curves = {name: (x, [max(v, FLOOR) for v in y]) for name, (x, y) in panel.curves.items()}
+        draw_curves(axes, curves, panel.xlabel, panel.ylabel)
+
+
+def plot(section: Section, folder: Path) -> str:
+    name = f"{section.name}.svg"
+    rows = math.ceil(len(section.panels) / 2)
+    save_plot(folder / name, lambda figure: draw(section, figure), (10.2, 5.2 * rows))
+    return name
+
+
+def verdict(panel: Panel) -> str:
+    """Whether our curves are left of and below the peers', and the number where they are not."""
+    ours = [point for name in panel.ours for point in zip(*panel.curves.get(name, ((), ())))]
+    behind = []
+    for name, (x, y) in panel.curves.items():
+        if name in panel.ours:
+            continue
+        worst = 1.0
+        for time, error in zip(x, y):
+            # The least time in which ours is as exact; else how much less exact it is in the same time.
+            as_exact = [t for t, e in ours if e <= max(error, FLOOR)]
+            ratio = min(as_exact) / time if as_exact else math.inf
+            worst = max(worst, ratio)
+        if worst > 1.05:
+            text = (
+                "reaches errors that ours does not" if math.isinf(worst) else f"as exact in 1/{worst:.1f} of our time"
+            )
+            behind.append(f"{name} ({text})")
+    where = f"*{panel.ylabel}*"
+    if not any(name not in panel.ours for name in panel.curves):
+        return f"{where}: no peer has a curve here."
+    if not behind:
+        return f"{where}: ours is left of and below every peer."
+    return f"{where}: **a peer is better somewhere**: {'; '.join(behind)}."
+
+
+# ---- pages -----------------------------------------------------------------------------------------------------------
+
+
+def machine(note: str, packages: Sequence[str]) -> list[str]:
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    versions = [f"Python {platform.python_version()}", *(f"{name} {installed_version(name)}" for name in packages)]
+    return [
+        f"{datetime.date.today().isoformat()}; {processor()}, {os.cpu_count()} cores{load}, {platform.system()}.",
+        ", ".join(versions) + ".",
+        "Times are on the processor, one thread, medians; ratios within this run hold, digits do not.",
+        *([note] if note else []),
+    ]
+
+
+def markdown(title: str, sections: Sequence[Section], plots: Mapping[str, str]) -> str:
+    lines = [f"# {title}", ""]
+    for section in sections:
+        lines += [f"## {section.title}", ""]
+        for text in section.text:
+            lines += [text, ""]
+        if section.name in plots:
+            lines += [f"![{section.title}]({plots[section.name]})", ""]
+        for table in section.tables:
+            lines += ["| " + " | ".join(table["columns"]) + " |", "|" + "---|" * len(table["columns"])]
+            lines += ["| " + " | ".join(cell(value) for value in row) + " |" for row in table["rows"]] + [""]
+    return "\n".join(lines)
+
+
+def page(title: str, sections: Sequence[Section], plots: Mapping[str, str]) -> str:
+    body = [f"<h1>{html.escape(title)}</h1>"]
+    for section in sections:
+        body.append(f'<h2 id="{section.name}">{html.escape(section.title)}</h2>')
+        body += [f"<p>{_inline(text)}</p>" for text in section.text]
+        if section.name in plots:
+            body.append(f'<img src="{plots[section.name]}" alt="{html.escape(section.title)}">')
+        for table in section.tables:
+            head = "".join(f"<th>{html.escape(name)}</th>" for name in table["columns"])
+            rows = ["".join(f"<td>{_inline(cell(value))}</td>" for value in row) for row in table["rows"]]
+            body.append(f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>")
+    style = (
+        "body{font:15px/1.5 sans-serif;max-width:62em;margin:2em auto;padding:0 1em}img{max-width:100%}"
+        "table{border-collapse:collapse}td,th{border:1px solid #ccc;padding:.2em .6em;text-align:left}"
+    )
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f"<style>{style}</style></head>\n<body>\n" + "\n".join(body) + "\n</body></html>\n"
+    )
+
+
+def cell(value: object) -> str:
+    return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _inline(text: str) -> str:
+    """Bold and italics of Markdown."""
+    text = html.escape(text)
+    for mark, tag in (("**", "b"), ("*", "i"), ("`", "code")):
+        parts = text.split(mark)
+        text = parts[0] + "".join(f"<{'' if i % 2 else '/'}{tag}>{part}" for i, part in enumerate(parts[1:], 1))
+    return text
+
+
+def write(folder: Path, title: str, sections: Sequence[Section]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    plots = {section.name: plot(section, folder) for section in sections if section.panels}
+    (folder / "index.md").write_text(markdown(title, sections, plots), encoding="utf-8")
+    (folder / "index.html").write_text(page(title, sections, plots), encoding="utf-8")
