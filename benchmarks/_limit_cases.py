@@ -238,7 +238,7 @@ def _chain(links: int) -> ds.Scene:
 
 def _cases() -> list[Case]:
     result = [
-        Case("mass ratio, heavy on light", f"{m:g}", lambda m=m: _heavy_on_light(m), _CONVERGES, quick=m == 1e6)
+        Case("mass ratio (heavy on light)", f"{m:g}", lambda m=m: _heavy_on_light(m), _CONVERGES, quick=m == 1e6)
         for m in _decades(0, 9)
     ]
     result += [
@@ -273,14 +273,14 @@ def _cases() -> list[Case]:
             reason=IMPACTS,
             quick=v == 1e3,
         )
-        for v in _decades(0, 5)
+        for v in _decades(1, 5)
     ]
     result += [
         Case("spin [rad/s]", f"{w:g}", lambda w=w: _spinning(w), _SPEAKS, reason=TURNS if w > 10 else "")
         for w in _decades(0, 4)
     ]
     result += [
-        Case("needle triangles, height [m]", f"{t:g}", lambda t=t: _needles(t), _CONVERGES) for t in _decades(-9, -3, 2)
+        Case("needle triangles: height [m]", f"{t:g}", lambda t=t: _needles(t), _CONVERGES) for t in _decades(-9, -3, 2)
     ]
     result.append(
         Case(
@@ -292,7 +292,7 @@ def _cases() -> list[Case]:
         )
     )
     result += [
-        Case("coplanar faces, gap [m]", f"{g:g}", lambda g=g: _gap(g), "comes to rest where it stands", still=1e-3)
+        Case("coplanar faces: gap [m]", f"{g:g}", lambda g=g: _gap(g), "comes to rest where it stands", still=1e-3)
         for g in (0.0, 1e-12, 1e-8, 1e-6, 1e-4)
     ]
     meetings = {
@@ -311,7 +311,12 @@ def _cases() -> list[Case]:
         for v in (0.1, 1.0, 10.0)
     ]
     result += [
-        Case("turned about an axis", f"{angle} about {axis}", lambda a=axis, d=angle: _turned(a, d), _CONVERGES)
+        Case(
+            "turned about an axis",
+            f"{angle}° about {' '.join(map(str, axis))}",
+            lambda a=axis, d=angle: _turned(a, d),
+            _CONVERGES,
+        )
         for angle in (90, 180)
         for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 1, 1))
     ]

@@ -55,29 +55,28 @@ def plot(section: Section, folder: Path) -> str:
 
 
 def verdict(panel: Panel) -> str:
-    """Whether our curves are left of and below the peers', and the number where they are not."""
+    """Whether our curves are left of and below each peer's, and the number where they are not."""
     ours = [point for name in panel.ours for point in zip(*panel.curves.get(name, ((), ())))]
-    behind = []
+    ours = [(t, e) for t, e in ours if not any(a < t and b <= e for a, b in ours)]  # the best of each error
+    behind, ahead = [], []
     for name, (x, y) in panel.curves.items():
-        if name in panel.ours:
+        if name in panel.ours or not ours or not len(x):
             continue
-        worst = 1.0
-        for time, error in zip(x, y):
-            # The least time in which ours is as exact; else how much less exact it is in the same time.
-            as_exact = [t for t, e in ours if e <= max(error, FLOOR)]
-            ratio = min(as_exact) / time if as_exact else math.inf
-            worst = max(worst, ratio)
-        if worst > 1.05:
-            text = (
-                "reaches errors that ours does not" if math.isinf(worst) else f"as exact in 1/{worst:.1f} of our time"
-            )
-            behind.append(f"{name} ({text})")
+        least = [(t, min((a for a, b in zip(x, y) if b <= max(e, FLOOR)), default=math.inf)) for t, e in ours]
+        worst = max(t / peer for t, peer in least)
+        finer = min(y) < 0.99 * min(e for _, e in ours)
+        if worst <= 1.0 and not finer:
+            ahead.append(f"{name} (never as exact)" if math.isinf(min(peer for _, peer in least)) else name)
+            continue
+        texts = [f"as exact as ours in 1/{worst:.1f} of the time"] if worst > 1.0 else []
+        texts += ["goes on to smaller errors than ours"] if finer else []
+        behind.append(f"{name} ({', '.join(texts)})")
     where = f"*{panel.ylabel}*"
-    if not any(name not in panel.ours for name in panel.curves):
+    if not behind and not ahead:
         return f"{where}: no peer has a curve here."
-    if not behind:
-        return f"{where}: ours is left of and below every peer."
-    return f"{where}: **a peer is better somewhere**: {'; '.join(behind)}."
+    texts = [f"**a peer is better somewhere**: {'; '.join(behind)}"] if behind else []
+    texts += [f"ours is left of and below {'; '.join(ahead)}"] if ahead else []
+    return f"{where}: {'. '.join(texts)}."
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------

@@ -66,6 +66,7 @@ def run(case: Case) -> dict[str, Any]:
 def _forward(case: Case, sim: ds.Simulator, start: ds.State, row: dict[str, Any]) -> list[tuple[int, ds.State]]:
     """The states from which steps with contact were taken, each with the number of its contacts."""
     state, in_contact, times, iterations = start, [], [], 0
+    longest = 0.0, start
     with torch.no_grad():
         energies = [float(sim.kinetic_energy(start) + sim.potential_energy(start))]
         distance = math.inf
@@ -73,6 +74,7 @@ def _forward(case: Case, sim: ds.Simulator, start: ds.State, row: dict[str, Any]
             began = time.process_time()
             end = sim(state)
             times.append(1e3 * (time.process_time() - began))
+            longest = max(longest, (times[-1], state), key=lambda pair: pair[0])
             info = sim.info
             assert info is not None
             row["failed_steps"] += info.failed_steps
@@ -90,9 +92,15 @@ def _forward(case: Case, sim: ds.Simulator, start: ds.State, row: dict[str, Any]
             if case.steps <= 100 or step % 100 == 0:
                 distance = min(distance, float(sim.min_distance(state)))
     row["iterations"], row["step_ms"] = iterations, statistics.median(times)
-    row["longest"] = max(times) / row["step_ms"]
-    if row["longest"] > LONGEST and max(times) > LEAST:
-        row["wrong"].append(f"a step took {max(times):.0f} ms, {row['longest']:.0f} times the median")
+    milliseconds, there = longest
+    for _ in range(2):  # a step is a function of its state: what else took time the first time is not its own
+        began = time.process_time()
+        with torch.no_grad():
+            sim(there)
+        milliseconds = min(milliseconds, 1e3 * (time.process_time() - began))
+    row["longest"] = max(milliseconds / row["step_ms"], 1.0)
+    if row["longest"] > LONGEST and milliseconds > LEAST:
+        row["wrong"].append(f"a step took {milliseconds:.0f} ms, {row['longest']:.0f} times the median")
     lowest = np.minimum.accumulate(energies)
     scale = max(energies[0] - float(lowest[-1]), 1e-9 * max(map(abs, energies)), 1e-300)
     row["energy_made"] = max(0.0, float((np.array(energies) - lowest).max())) / scale

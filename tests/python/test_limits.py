@@ -13,15 +13,15 @@ from _limit_cases import CASES, Case
 from limits import judge, run
 
 GREEN = {
-    ("mass ratio, heavy on light", "10000"),
+    ("mass ratio (heavy on light)", "10000"),
     ("compliance", "0"),
     ("dt [s]", "1e-06"),
     ("size [m]", "1e-06"),
     ("size [m]", "100000"),
     ("triangles twice", "all"),
-    ("coplanar faces, gap [m]", "1e-08"),
+    ("coplanar faces: gap [m]", "1e-08"),
     ("meeting", "corner on corner"),
-    ("turned about an axis", "180 about (1, 1, 1)"),
+    ("turned about an axis", "180° about 1 1 1"),
 }
 CHOSEN = [case for case in CASES if (case.family, case.value) in GREEN]
 
