@@ -42,9 +42,13 @@ class Section:
 
 def draw(section: Section, figure: Any) -> None:
     rows = math.ceil(len(section.panels) / 2)
-    for axes, panel in zip(figure.subplots(rows, min(2, len(section.panels)), squeeze=False).flat, section.panels):
+    grid = list(figure.subplots(rows, min(2, len(section.panels)), squeeze=False).flat)
+    for axes, panel in zip(grid, section.panels):
         curves = {name: (x, [max(v, FLOOR) for v in y]) for name, (x, y) in panel.curves.items()}
         draw_curves(axes, curves, panel.xlabel, panel.ylabel)
+        axes.tick_params(axis="x", which="minor", labelsize=6, labelrotation=45)  # there may be no power of ten
+    for axes in grid[len(section.panels) :]:
+        axes.set_axis_off()
 
 
 def plot(section: Section, folder: Path) -> str:
