@@ -7,6 +7,7 @@
 # make lint       formatting, lint, types
 # make docs       the documentation as a site, build/docs/index.html
 # make bench      every benchmark, one CSV line per run
+# make report     error against run time beside MuJoCo, docs/report/; then the limits, docs/limits.md
 # make clean      remove .venv, build/ and caches
 #
 # Needs Python >= 3.10 with venv, a C++17 compiler and make; all else is installed into .venv.
@@ -35,7 +36,7 @@ SOURCES := pyproject.toml CMakeLists.txt \
            $(shell find csrc diffsim -type f ! -path '*/__pycache__/*' ! -name '_core*.so')
 CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')
 
-.PHONY: demo examples notebooks test test-cpp test-python check sanitize lint format docs bench clean
+.PHONY: demo examples notebooks test test-cpp test-python check sanitize lint format docs bench report clean
 .NOTPARALLEL:
 
 demo: $(VENV)/.with-examples
@@ -84,6 +85,10 @@ docs: $(VENV)/.with-test $(VENV)/.docs-tools
 
 bench: $(VENV)/.with-bench
 	@for script in $(sort $(wildcard benchmarks/[a-z]*.py)); do $(BIN)/python $$script || exit 1; done
+
+report: $(VENV)/.with-bench
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/work_precision.py --out docs/report
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/limits.py --out docs
 
 clean:
 	rm -rf .venv build .mypy_cache .pytest_cache .ruff_cache

@@ -21,6 +21,7 @@ from torch import Tensor
 
 import diffsim as ds
 from diffsim import _core
+from diffsim._check import CLOTH_PARAMETERS
 from diffsim.ops import RolloutCall, rollout
 
 Result = TypeVar("Result")
@@ -239,13 +240,14 @@ class Recorded:
 
 
 def tape_bytes(sim: ds.Simulator, start: ds.State, steps: int) -> int:
-    """What a rollout of bodies keeps for its backward; not public, so asked of the operator."""
+    """What a rollout keeps for its backward; not public, so asked of the operator."""
     call = RolloutCall(sim._model, sim._options, steps, 1, keep_time=True)
-    bodies = (start.position, start.orientation, start.velocity, start.angular_velocity)
-    no_cloth_nor_controls = (None,) * 8
+    state = [value if value.numel() else None for value in (getattr(start, name).detach() for name in STATE_FIELDS)]
+    first = next(value for value in state if value is not None)
+    cloth = [getattr(sim, name) for name in CLOTH_PARAMETERS] if start.node_position.numel() else [None] * 5
     with torch.enable_grad():
-        position = bodies[0].detach().requires_grad_()
-        rollout(call, position, *bodies[1:], *no_cloth_nor_controls, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
+        first.requires_grad_()
+        rollout(call, *state, *(None,) * 6, sim.mass, sim.inertia, sim.gravity, *cloth)
     assert isinstance(call.tape, _core.Tape)
     return call.tape.nbytes
 

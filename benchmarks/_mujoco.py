@@ -44,17 +44,29 @@ def boxes(
     return model, data
 
 
-def frictionless(scene: ds.Scene, state: ds.State, *, dt: float) -> tuple[Any, Any]:
+def frictionless(
+    scene: ds.Scene,
+    state: ds.State,
+    *,
+    dt: float,
+    integrator: str = "Euler",
+    stiff: bool = False,
+    mass: ArrayLike | None = None,
+) -> tuple[Any, Any]:
     """Model and data of the bodies of a scene at a state, without friction, else with default options.
 
     Meshes of 8 vertices are boxes, and must be upright in their body's frame; of others MuJoCo takes the convex hull.
+    `stiff`: contacts as stiff as a step lets them be, not the default ones. `mass`: in place of the scene's [kg].
     """
     p = scene.pack()
+    mass = p.mass if mass is None else np.asarray(mass)
     meshes, bodies = [], []
     last = np.cumsum(p.vertex_count)
     for body, (name, count) in enumerate(zip(p.names, p.vertex_count)):
         points = p.vertices[last[body] - count : last[body]]
-        if count == 8:
+        if count == 1:
+            shape = f'type="sphere" size="{_numbers(p.margin[body])}"'
+        elif count == 8:
             shape = f'type="box" size="{_numbers(np.ptp(points, axis=0) / 2)}"'
         else:
             shape = f'type="mesh" mesh="{name}"'
@@ -62,14 +74,16 @@ def frictionless(scene: ds.Scene, state: ds.State, *, dt: float) -> tuple[Any, A
         place = f'pos="{_numbers(state.position[body])}" quat="{_numbers(state.orientation[body])}"'
         if p.kind[body] == 0:
             inertia = p.inertia[body][[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-            mass = f'<inertial pos="0 0 0" mass="{p.mass[body]}" fullinertia="{_numbers(inertia)}"/>'
-            bodies.append(f"<body {place}><freejoint/>{mass}<geom {shape}/></body>")
+            inertial = f'<inertial pos="0 0 0" mass="{_numbers(mass[body])}" fullinertia="{_numbers(inertia)}"/>'
+            bodies.append(f"<body {place}><freejoint/>{inertial}<geom {shape}/></body>")
         else:
             bodies.append(f"<geom {shape} {place}/>")
+    ground = f'<geom type="plane" size="0 0 1" pos="0 0 {p.ground_height}"/>' if p.has_ground else ""
+    contact = f'solref="{2.0 * dt} 1" solimp="0.9999 0.9999 0.001"' if stiff else ""
     model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="{dt}" gravity="{_numbers(p.gravity)}"/><default><geom condim="1"/></default>
-        <asset>{"".join(meshes)}</asset><worldbody><geom type="plane" size="0 0 1" pos="0 0 {p.ground_height}"/>
-        {"".join(bodies)}</worldbody></mujoco>"""
+        f"""<mujoco><option timestep="{dt}" integrator="{integrator}" gravity="{_numbers(p.gravity)}"/>
+        <default><geom condim="1" {contact}/></default>
+        <asset>{"".join(meshes)}</asset><worldbody>{ground}{"".join(bodies)}</worldbody></mujoco>"""
     )
     data = mujoco.MjData(model)
     moving = p.kind == 0

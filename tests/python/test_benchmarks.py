@@ -24,11 +24,14 @@ COLUMNS = {
     "contact_rich": ("scene", "forward_ms", "longest_ms", "failed_steps", "forward_to_mujoco", "longest_to_resting"),
     "falling_cubes": ("cubes", "forward_s", "mujoco_elliptic_s", "memory_mb", "rest_gap_m"),
     "fast_differentiation": ("cubes", "mode", "backward_ms", "memory_mb", "error", "backward_to_mujoco"),
+    "limits": ("case", "name", "state", "what", "energy_made", "distance", "iterations", "error", "failed_steps"),
     "local_collisions": ("cubes", "step", "mode", "local_ms", "global_ms", "lcp_published_ms", "paper_code_ms"),
     "many_objects": ("objects", "forward_backward_s", "mujoco_forward_s", "memory_mb", "mpm_s", "paper_code_s"),
     "memory": ("case", "cubes", "peak_mb", "tape_bytes_per_body_step"),
     "overhead": ("run", "nothing_forward_us", "backward_ratio"),
+    "pay_for_use": ("case", "what", "step_us", "ratio", "tape_bytes_per_step", "module_mb"),
     "relative_scale": ("scale", "forward_backward_s", "memory_mb", "most_iterations"),
+    "work_precision": ("scene", "what", "name", "dt_s", "time_ms", "error"),
     "threads": ("cubes", "threads", "forward_s", "backward_speedup"),
 }
 POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times
