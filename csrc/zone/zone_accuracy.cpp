@@ -31,8 +31,10 @@ Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double p
         residual = std::max(residual, derivatives.gradient.nodes[i].norm() / root_mass);
         reference = std::max(reference, (node.last_motion - node.target).norm() * root_mass);
     }
-    // Nothing pushes here and nothing did before: only the exact answer will do, or a step lost in rounding.
-    if (!(reference > 0.0)) return {residual > 0.0 ? 1.0 : 0.0, 0.0};
+    // Nothing pushes here and nothing did before: only the exact answer will do, or what rounding makes of a contact that is at
+    // its rest distance.
+    if (!(reference > 0.0)) reference = residual;
+    if (!(reference > 0.0)) return {0.0, 0.0};
     return {residual / reference, kEpsilon * position * derivatives.largest_stiffness / reference};
 }
 

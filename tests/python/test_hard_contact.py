@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -114,3 +115,16 @@ def test_dense_and_qr_agree() -> None:
         gradients.append(gradient)
     assert gradients[0].abs().max() > 0.0
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-9, atol=1e-9 * float(gradients[0].abs().max()))
+
+
+@pytest.mark.parametrize("mass", [1.0, 2.0, 3.0, 10.0])
+@pytest.mark.parametrize("dt", [0.02, 0.01, 0.005])
+def test_bodies_go_on_together_after_a_hard_impact(mass: float, dt: float) -> None:
+    """They stay at their rest distance up to rounding, where a contact may be found to push or not."""
+    for gap in (0.2, 0.205, 0.2137):
+        scene = ds.Scene(gravity=(0.0, 0.0, 0.0))
+        scene.add_sphere(0.1, mass=1.0, velocity=(1.0, 0.0, 0.0))
+        scene.add_sphere(0.1, mass=mass, position=(0.2 + gap, 0.0, 0.0))
+        sim = ds.Simulator(scene, dt=dt, compliance=0.0, on_failure="raise")
+        end = sim.rollout(sim.initial_state(), steps=round(0.5 / dt))[-1]
+        np.testing.assert_allclose(end.velocity[:, 0].numpy(), 1.0 / (1.0 + mass), atol=1e-9)
