@@ -41,16 +41,19 @@ class RolloutCall:
         keep_time: Whether the outputs have one, or are those of the last step.
         keep_tape: Whether the backward finds a record; without, it runs the forward again (checkpointing).
         want_signature: Whether `signature` is to be filled in.
+        want_contacts: Whether `contacts` is.
         first_step: How many steps other calls made before, for error messages.
         single: Whether gradients must fit into single precision, where a float32 input will have them.
 
     Attributes:
         info: Statistics, after the call.
         tape: What the backward needs, where something requires grad.
+        contacts: What pushed in the last step, arrays by name.
         signature: Hash of each step's active contacts, uint64, shape (steps[, B]).
     """
 
     __slots__ = (
+        "contacts",
         "controls_have_time",
         "first_step",
         "info",
@@ -64,6 +67,7 @@ class RolloutCall:
         "single",
         "steps",
         "tape",
+        "want_contacts",
         "want_signature",
     )
 
@@ -77,6 +81,7 @@ class RolloutCall:
         keep_time: bool = False,
         keep_tape: bool = True,
         want_signature: bool = False,
+        want_contacts: bool = False,
         first_step: int = 0,
         single: bool = False,
     ) -> None:
@@ -88,12 +93,14 @@ class RolloutCall:
         self.keep_time = keep_time
         self.keep_tape = keep_tape
         self.want_signature = want_signature
+        self.want_contacts = want_contacts
         self.first_step = first_step
         self.single = single
         self.record = False
         self.tape: _core.Tape | None = None
         self.info: _core.Info | None = None
         self.signature: np.ndarray | None = None  # uint64 hash of the active contacts, shape (steps[, B])
+        self.contacts: dict[str, np.ndarray] | None = None  # of the last step, see ContactReadout of the core
 
 
 def run_forward(call: RolloutCall, inputs: Sequence[Tensor | None]) -> OptionalTensors:
@@ -103,8 +110,11 @@ def run_forward(call: RolloutCall, inputs: Sequence[Tensor | None]) -> OptionalT
     except RuntimeError:
         _refuse_sparse(inputs)
         raise
-    result = _run(call, arrays, call.record)
-    call.tape = result.tape
+    result = _run(call, arrays, call.record or call.want_contacts)
+    if call.want_contacts:
+        assert result.tape is not None  # it was recorded
+        call.contacts = _core.contacts(result.tape, arrays)
+    call.tape = result.tape if call.record else None
     call.info = result.info
     if call.want_signature:
         call.signature = result.signature

@@ -391,26 +391,19 @@ class Simulator(SceneIdentity, Measurements):
         Gradients: As for one step, to forces, positions, normals and distances; none to forces with ``compliance=0``,
             whose backward raises NotImplementedError.
         """
-        end = self.forward(state, control, parameters=parameters)
         values = self._values("contacts", parameters)
-        inputs = self._checked_inputs("contacts", state, control, None, values)[0]
-        arrays = [None if t is None else t.detach().contiguous().numpy(force=True) for t in inputs]
-        taken = _core.rollout(
-            self._model,
-            self._options,
-            arrays,
-            steps=1,
-            controls_have_time=False,
-            keep_time=False,
-            record=True,
-            num_threads=1,
-            first_step=0,
-        )
-        assert taken.tape is not None  # it was recorded
-        read = _core.contacts(taken.tape, arrays)
+        inputs, _, single = self._checked_inputs("contacts", state, control, None, values)
+        if self._check:
+            self._check_unread(values["friction"], values["restitution"])
+        call = self._make_call(1, single=single, want_contacts=True)
+        end = state_from(rollout(call, *inputs), state)  # type: ignore[arg-type]
+        self._finish([call.info], end)
+        assert call.contacts is not None  # they were asked for
         hard = self._settings["compliance"] == 0.0
         names = (*self._object_names, "ground")
-        return contacts_from(read, end, values["mass"], values["cloth_density"], self._cloth_of_node, names, hard)
+        return contacts_from(
+            call.contacts, end, values["mass"], values["cloth_density"], self._cloth_of_node, names, hard
+        )
 
     def _values(self, where: str, parameters: Mapping[str, Tensor] | None) -> Mapping[str, Any]:
         """The parameters of the module, and what takes their place in this call."""
