@@ -33,7 +33,6 @@ from _report_page import cell, machine
 from torch import Tensor
 
 import diffsim as ds
-from diffsim.ops import GradientError, SolverError
 
 COLUMNS = ("case", "name", "state", "what", "energy_made", "distance", "iterations", "step_ms", "longest", "error")
 COLUMNS += ("failed_steps",)
@@ -58,7 +57,7 @@ def run(case: Case) -> dict[str, Any]:
         states = _forward(case, sim, start, row)
         _backward(case, sim, start, row)
         _derivatives(case, sim, states, row)
-    except (ValueError, SolverError, GradientError) as error:
+    except (ValueError, ds.SolverError, ds.GradientError) as error:
         row["wrong"].append(f"{type(error).__name__}: {error}")
     return row
 
