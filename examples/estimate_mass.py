@@ -33,13 +33,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _stage import Camera, Item, draw_items, report, save_figure
+from _stage import report, save_figure
 from scipy import stats
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 from tqdm import tqdm
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 F64 = torch.float64
 
@@ -94,7 +95,7 @@ def descend(speed: float, steps: int = DESCENT_STEPS) -> Descent:
         # Of ½ (momentum - MOMENTUM)².
         gradient = (momentum.item() - MOMENTUM) * sensitivity.item()
         descent.masses.append(mass.item() - RATE / speed**2 * gradient)
-        descent.together = float((end.velocity[0] - end.velocity[1]).norm())
+        descent.together = float((end.velocity[0] - end.velocity[1]).detach().norm())
     return descent
 
 
@@ -291,7 +292,7 @@ def draw(descent: Descent, recording: Recording, main: Fit, coverage: Coverage, 
         with torch.no_grad():
             frames = recording.trajectory(main.logarithms)
         sim = recording.rollout.sim
-        items = [Item(sim.mesh(frames[24], recording.sheet), (0.50, 0.66, 0.80), 0.85, two_sided=True, edges=0.25)]
+        items = [Item(sim.mesh(frames[24], recording.sheet), (0.50, 0.66, 0.80), 0.85, two_sided=True, edges=True)]
         for index, shade in ((0, 0.95), (11, 0.75), (24, 0.6)):
             items.append(Item(sim.mesh(frames[index], recording.box), (shade, 0.55 * shade, 0.25 * shade)))
         draw_items(middle, items, Camera(-62.0, 14.0), shadows=False)

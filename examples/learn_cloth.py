@@ -27,10 +27,11 @@ import gymnasium
 import numpy as np
 import torch
 from _learning import Learning, by_ddpg, by_gradient, draw, findings, play, summary, test_starts
-from _stage import Camera, Item, Judge, draw_items, report
+from _stage import Judge, report
 from torch import Tensor
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 DT, STEPS = 0.04, 25  # [s]
 BOX, MASS, GRAVITY = (0.08, 0.12, 0.11), 0.3, 2.0  # [m], [kg], [m/s²]
@@ -125,7 +126,7 @@ def draw_scene(axes: Any, task: Any, ours: Learning) -> None:
         for body, color in ((1, (0.50, 0.66, 0.80)), (0, (0.93, 0.55, 0.25))):
             mesh = sim.mesh(moments[index].state[0], body)
             mesh.apply_translation(shift)
-            items.append(Item(mesh, color, two_sided=body == 1, edges=0.25 * body))
+            items.append(Item(mesh, color, two_sided=body == 1, edges=body == 1))
         marks.append(camera.project(moments[0].goal.numpy()[0] + shift))
     draw_items(axes, items, camera, shadows=False)
     axes.plot(*np.array(marks)[:, :2].T, "+", ms=12, mew=2.0, color="#0a7d33", zorder=4)

@@ -27,10 +27,11 @@ import gymnasium
 import numpy as np
 import torch
 from _learning import Learning, by_ddpg, by_gradient, draw, findings, play, summary, test_starts
-from _stage import Camera, Item, draw_items, report
+from _stage import report
 from torch import Tensor
 
 import diffsim as ds
+from diffsim.viewer import Camera, Item, draw_items
 
 DT, STEPS = 0.04, 25  # [s]
 BLOCK = (2.8, 2.8, 2.0)  # [m]
@@ -131,7 +132,7 @@ def draw_scene(axes: Any, task: Any, ours: Learning) -> None:
             mesh.apply_translation(shift)
             items.append(Item(mesh, color))
         marks.append(camera.project(moments[0].goal.numpy()[0] + shift))
-    draw_items(axes, items, camera, shadows=False, largest=0.3)
+    draw_items(axes, items, camera, shadows=False, split=0.3)
     axes.plot(*np.array(marks)[:, :2].T, "+", ms=12, mew=2.0, color="#0a7d33", zorder=4)
     axes.set_title("a test target, t = 0, 0.48 and 1 s", fontsize=10, color="0.2")
 

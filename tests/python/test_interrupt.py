@@ -26,6 +26,14 @@ def resting_boxes(num_threads: int) -> ds.Simulator:
     return ds.Simulator(scene, dt=0.01, num_threads=num_threads)
 
 
+@pytest.fixture(autouse=True)
+def _ctrl_c_interrupts() -> Iterator[None]:
+    """Workers of pytest-xdist ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @contextmanager
 def ctrl_c() -> Iterator[None]:
     timer = threading.Timer(DELAY, os.kill, (os.getpid(), signal.SIGINT))
