@@ -5,8 +5,8 @@
 # each of 50 steps, takes it to a target within two seconds, and is the least that does? That is a hundred unknowns, and
 # one gradient says what to do with all of them.
 #
-# `examples/marble_inverse.py` is the same problem for five targets, beside CMA-ES, which is still a hundred times
-# further from the solution after a hundred times as many simulations.
+# `examples/marble_inverse.py` is the same problem for five targets, beside CMA-ES, which is still two to
+# five times further from the solution after a hundred times as many simulations.
 
 # %%
 import math
