@@ -124,9 +124,11 @@ def contacts_from(
     if hard:
         magnitude = _HardForce.apply(magnitude)  # type: ignore[no-untyped-call]
     magnitude = magnitude * (1.0 + _change(_log_mollifier(core["sine_sq"], first, second)))
+    normal = core["normal"] + _change(normal)
+    middle = core["point"].mean(dim=1) + _change(point - 0.5 * offset)
     return Contacts(
         objects=core["objects"],
-        position=(point - 0.5 * offset).to(end.dtype),
+        position=middle.to(end.dtype),
         normal=normal.to(end.dtype),
         distance=(core["distance"] + _change(distance)).to(end.dtype),
         force=(magnitude[:, None] * normal).to(end.dtype),
@@ -176,9 +178,9 @@ def _mass_of_side(
 def _log_mollifier(sine_sq: Tensor, first: _Side, second: _Side) -> Tensor:
     """Of pairs of edges that are nearly parallel, 0 of others; see `edge_mollifier` of the core."""
     result = torch.zeros(len(sine_sq), dtype=torch.float64)
-    mask = (sine_sq < _PARALLEL_LIMIT) & (sine_sq > 0.0)
+    mask = sine_sq < _PARALLEL_LIMIT
     if mask.any():
-        a, b = first.slides[mask, 0], second.slides[mask, 0]
+        a, b = first.edge[mask], second.edge[mask]
         cross = torch.linalg.cross(a, b).square().sum(dim=-1)
         ratio = cross / (a.square().sum(dim=-1) * b.square().sum(dim=-1)) / _PARALLEL_LIMIT
         result = result.index_put((mask,), (ratio * (2.0 - ratio)).log())
@@ -186,40 +188,48 @@ def _log_mollifier(sine_sq: Tensor, first: _Side, second: _Side) -> Tensor:
 
 
 class _Side:
-    """One object's closest points (k, 3) and unit directions of slide (k, 2, 3), zero where there are fewer."""
+    """One object's closest points (k, 3), unit directions of their slides (k, 2, 3), zero where there are fewer, and of
+    pairs of edges its edges (k, 3), which move with its bodies or nodes.
+    """
 
-    def __init__(self, tensors: dict[str, Tensor], side: int, end: State) -> None:
-        self.point = tensors["point"][:, side]
-        count = tensors["slide_count"][:, side]
-        used = torch.arange(2) < count[:, None]
-        self.slides = tensors["slides"][:, side] * used[..., None]
-        scene, index = tensors["scene"], tensors["objects"][:, side]
-        nodes = tensors["nodes"][:, side]
-        bodies = end.position.shape[-2]
-        self._move_with_bodies(index < bodies, scene, index, end)
-        self._move_with_nodes(nodes[:, 0] >= 0, scene, nodes, tensors, side, end)
+    def __init__(self, core: dict[str, Tensor], side: int, end: State) -> None:
+        self.point, self.edge = core["point"][:, side], core["edge"][:, side]
+        used = torch.arange(2) < core["slide_count"][:, side, None]
+        self.slides = core["slides"][:, side] * used[..., None]
+        on_body = core["objects"][:, side] < end.position.shape[-2]
+        if on_body.any():
+            self._move_with_bodies(on_body, core, side, end)
+        on_cloth = core["nodes"][:, side, 0] >= 0
+        if on_cloth.any():
+            self._move_with_nodes(on_cloth, core, side, end)
 
-    def _move_with_bodies(self, mask: Tensor, scene: Tensor, index: Tensor, end: State) -> None:
-        if not mask.any():
-            return
-        position = end.position.to(torch.float64).reshape(-1, *end.position.shape[-2:])[scene[mask], index[mask]]
-        orientation = end.orientation.to(torch.float64).reshape(-1, *end.orientation.shape[-2:])
-        turn = rotation.to_matrix(orientation[scene[mask], index[mask]])
-        back = turn.detach().transpose(-1, -2)
-        local = torch.einsum("kxy,ky->kx", back, self.point[mask] - position.detach())
-        moved = position + torch.einsum("kxy,ky->kx", turn, local)
-        self.point = self.point.index_put((mask,), moved)
-        slides = torch.einsum("kxy,kyz,kdz->kdx", turn, back, self.slides[mask])
+    def _move_with_bodies(self, mask: Tensor, core: dict[str, Tensor], side: int, end: State) -> None:
+        where = core["scene"][mask], core["objects"][mask, side]
+        position = _by_scene(end.position)[where]
+        turn = rotation.to_matrix(_by_scene(end.orientation)[where])
+        moved = turn @ turn.detach().transpose(-1, -2)  # the unit matrix, with the derivative of a turn
+        arm = self.point[mask] - position.detach()
+        self._put(
+            mask,
+            position + (moved @ arm[..., None])[..., 0],
+            self.slides[mask] @ moved.transpose(-1, -2),
+            (moved @ self.edge[mask][..., None])[..., 0],
+        )
+
+    def _move_with_nodes(self, mask: Tensor, core: dict[str, Tensor], side: int, end: State) -> None:
+        nodes = core["nodes"][mask, side].clamp(min=0)
+        corners = _by_scene(end.node_position)[core["scene"][mask, None], nodes]  # (k, 3 nodes, 3)
+        weights, slide_weights = core["weights"][mask, side], core["slide_weights"][mask, side]
+        point = (weights[:, None] @ corners)[:, 0]
+        is_edge = self.edge[mask].any(dim=-1)
+        self._put(mask, point, slide_weights @ corners, (corners[:, 1] - corners[:, 0]) * is_edge[:, None])
+
+    def _put(self, mask: Tensor, point: Tensor, slides: Tensor, edge: Tensor) -> None:
+        self.point = self.point.index_put((mask,), point)
         self.slides = self.slides.index_put((mask,), slides)
+        self.edge = self.edge.index_put((mask,), edge)
 
-    def _move_with_nodes(
-        self, mask: Tensor, scene: Tensor, nodes: Tensor, tensors: dict[str, Tensor], side: int, end: State
-    ) -> None:
-        if not mask.any() or end.node_position is None:
-            return
-        all_nodes = end.node_position.to(torch.float64).reshape(-1, *end.node_position.shape[-2:])
-        corners = all_nodes[scene[mask, None], nodes[mask].clamp(min=0)]  # (k, 3 nodes, 3)
-        moved = torch.einsum("kn,knx->kx", tensors["weights"][mask, side], corners)
-        self.point = self.point.index_put((mask,), moved)
-        slides = torch.einsum("kdn,knx->kdx", tensors["slide_weights"][mask, side], corners)
-        self.slides = self.slides.index_put((mask,), slides)
+
+def _by_scene(tensor: Tensor) -> Tensor:
+    """In float64, with one batch axis in front."""
+    return tensor.to(torch.float64).reshape(-1, *tensor.shape[-2:])

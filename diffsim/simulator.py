@@ -387,10 +387,11 @@ class Simulator(SceneIdentity, Measurements):
         Args: As for one step.
         Returns: What pushes at the end of the step, and with it, as `Contacts.end`, the state there. Over a batch the
             contacts of all scenes, scene by scene. An impact's force is large: its impulse divided by `dt`.
-        Raises: As for one step.
+        Raises: As for one step; NotImplementedError inside a transform of torch.func.
         Gradients: As for one step, to forces, positions, normals and distances; none to forces with ``compliance=0``,
             whose backward raises NotImplementedError.
         """
+        self._refuse_transforms("contacts")
         values = self._values("contacts", parameters)
         inputs, _, single = self._checked_inputs("contacts", state, control, None, values)
         if self._check:

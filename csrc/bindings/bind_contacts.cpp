@@ -50,6 +50,7 @@ public:
             m_mass_exponent.push_back(side.mass_exponent);
             m_nodes.insert(m_nodes.end(), side.nodes.begin(), side.nodes.end());
             append(m_point, side.point);
+            append(m_edge, side.edge);
             append(m_weights, side.weights);
             for (int k = 0; k < 2; ++k) {
                 append(m_slides, side.slides[k]);
@@ -70,6 +71,7 @@ public:
         result["stiffness"] = shaped(m_stiffness, {k});
         result["mass_exponent"] = shaped(m_mass_exponent, {k, 2});
         result["point"] = shaped(m_point, {k, 2, 3});
+        result["edge"] = shaped(m_edge, {k, 2, 3});
         result["slide_count"] = shaped(m_slide_count, {k, 2});
         result["slides"] = shaped(m_slides, {k, 2, 2, 3});
         result["nodes"] = shaped(m_nodes, {k, 2, 3});
@@ -88,8 +90,8 @@ private:
     }
 
     std::vector<std::int64_t> m_scene, m_object, m_slide_count, m_nodes;
-    std::vector<double> m_normal, m_distance, m_sine_sq, m_force, m_stiffness, m_mass_exponent, m_point, m_slides,
-        m_weights, m_slide_weights;
+    std::vector<double> m_normal, m_distance, m_sine_sq, m_force, m_stiffness, m_mass_exponent, m_point, m_edge,
+        m_slides, m_weights, m_slide_weights;
 };
 
 py::dict bound_contacts(const std::shared_ptr<Tape>& tape, const InputArrays& inputs) {

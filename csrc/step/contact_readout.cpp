@@ -64,6 +64,10 @@ ContactReadout read_contact(const Zone& zone, const ZonePoint& point, const Acti
     result.normal = n;
     result.distance = geometry.distance;
     result.sine_sq = geometry.sine_sq;
+    if (contact.contact.type == ContactType::edge_edge) {
+        result.sides[0].edge = geometry.closest.a.edge;
+        result.sides[1].edge = geometry.closest.b.edge;
+    }
     result.force = share * potential.force;
     result.stiffness = share * potential.stiffness;
     return result;

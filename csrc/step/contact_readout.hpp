@@ -16,6 +16,7 @@ struct ContactReadout {
         Vec3 point = Vec3::Zero();
         int slide_count = 0;
         std::array<Vec3, 2> slides = {Vec3::Zero(), Vec3::Zero()};
+        Vec3 edge = Vec3::Zero();  ///< of two edges this one, from end to end; zero of other features
         // Of cloth: nodes of the model, -1 fills the rest; the point is their weighted sum, so are the slides.
         std::array<int, 3> nodes = {-1, -1, -1};
         Vec3 weights = Vec3::Zero();

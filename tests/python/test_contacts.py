@@ -111,6 +111,27 @@ def ball_on_sheet() -> ds.Simulator:
     return ds.Simulator(scene, dt=DT)
 
 
+def test_edges_that_are_nearly_parallel_push_by_finite_forces() -> None:
+    """Cubes that land in a row, turned by 1e-3 and less: some closest points lie at an edge's end."""
+    sim = ds.Simulator(scenes.two_layer_stack(6), dt=DT)
+    state = sim(sim.initial_state()).detach()
+    leaf = state.orientation.clone().requires_grad_()
+    contacts = sim.contacts(state.replace(orientation=leaf))
+    assert contacts.force.isfinite().all()
+    change = sim.mass[:, None] * (contacts.end.velocity - state.velocity - DT * sim.gravity)
+    np.testing.assert_allclose(DT * contacts.net_force().detach(), change.detach(), rtol=1e-6, atol=1e-9)
+    (gradient,) = torch.autograd.grad(contacts.net_torque().sum(), [leaf])
+    assert gradient.isfinite().all()
+    assert gradient.any()
+
+
+def test_contacts_are_refused_inside_transforms() -> None:
+    sim = cube_on_ground()
+    state = sim.initial_state()
+    with pytest.raises(NotImplementedError, match=r"contacts: cannot run inside a transform"):
+        torch.func.vmap(lambda v: sim.contacts(state.replace(velocity=v)).force)(state.velocity[None])
+
+
 FIELDS = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
 
 
