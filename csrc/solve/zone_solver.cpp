@@ -382,11 +382,10 @@ private:
         if (!way.found) return ModelStep::near;
         const double step = m_path.covered_step(m_w.y_end, way.free);
         if (!driven) {
-            if (way.squeezes && step < kSqueeze) return ModelStep::blocked;
             const DriveProgress progress = advance_drives(step, stalls);
             if (progress == DriveProgress::blocked) return ModelStep::blocked;
             if (progress == DriveProgress::moved) accept_trial();
-            return ModelStep::taken;
+            return way.squeezes && step < kSqueeze ? ModelStep::blocked : ModelStep::taken;
         }
         if (!(step > 0.0)) return ModelStep::near;
         m_path.set_trial(m_w.y_end, step);

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "cloth_fixtures.hpp"
 #include "fixtures.hpp"
 
 using namespace diffsim;
@@ -79,4 +80,27 @@ TEST(a_body_that_seems_held_meets_its_neighbour_all_the_same) {
     released.zone.bodies[0].target[3] = 3.0 * kGap;
     CHECK(released.solve().status == ZoneStatus::converged);
     CHECK(released.touching_pairs() > 0);
+}
+
+TEST(a_press_finds_in_few_steps_that_it_squeezes_a_pile) {
+    Cubes pile(true);
+    const double pitch = 2.0 * kHalf + kThickness;
+    pile.zone.bodies[1].start.t = pile.zone.bodies[0].start.t + Vec3(0.0, 0.0, pitch);
+    pile.model.bodies.push_back(
+        fixtures::body(fixtures::box(Vec3(0.1, 0.1, kHalf)), 0.5 * kThickness, BodyKind::kinematic));
+    const Pose above{Mat3::Identity(), Vec3(0.0, 0.0, kHalf + 2.0 * pitch + 2.0 * kThickness)};
+    const auto press = [&](double way) {
+        Vec6 target = Vec6::Zero();
+        target[5] = -way;
+        pile.zone.bodies.resize(2);
+        return solve_zone(
+            pile.zone, fixtures::passive_bodies(pile.model, {{2, above, target}}), {}, pile.workspace, pile.visited);
+    };
+    CHECK(press(1e-4).status == ZoneStatus::converged);  // it comes to lie on the pile
+    for (const double way : {1e-3, 5e-3, 2e-2}) {
+        const ZoneResult result = press(way);
+        CHECK(result.status == ZoneStatus::blocked);
+        CHECK(result.iterations <= 2);
+        CHECK(pile.workspace.point.y.bodies[2][5] < -1e-4);  // it goes as far as there is room
+    }
 }
