@@ -15,23 +15,19 @@ Without stable-baselines3 (`pip install "mesh-diffsim[rl]"`) DDPG is left out, a
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from _learning import Learning, by_ddpg, by_gradient, draw, findings, play, summary, test_starts
+from _learning import Learning, Program, draw_moments, findings, play, test_starts
 from _stage import report
 from torch import Tensor
 
 import diffsim as ds
-from diffsim.viewer import Camera, Item, draw_items
+from diffsim.viewer import Camera
 
 DT, STEPS = 0.04, 25  # [s]
 BLOCK = (2.8, 2.8, 2.0)  # [m]
@@ -40,8 +36,7 @@ DENSITY, GRAVITY = 10.0, 1.0  # of the block [kg/m³], [m/s²]
 SPEED = 5.0  # of a stick at most [m/s]
 SIDE, UP, SPREAD = 1.0, 2.0, 0.05  # of the targets [m]
 
-EPISODES, QUICK_EPISODES = 100, 100
-SEEDS, RATE = 5, 3e-3
+PROGRAM = Program("learn_sticks", __doc__, episodes=100, quick_episodes=100, rate=3e-3)
 REACH = 0.05  # of the distance that may be left
 GRADIENT_ERROR = 1e-4  # of an episode's gradient, relative
 
@@ -121,47 +116,16 @@ def check(task: Any, left: Any, ours: Learning, ddpg: Learning | None) -> bool:
 
 
 def draw_scene(axes: Any, task: Any, ours: Learning) -> None:
-    with torch.no_grad():
-        moments, _ = play(task, ours.controllers[0], test_starts(task)[:1])
-    items, marks, sim = [], [], task.simulator
-    camera = Camera(-84.0, 9.0)
-    for place, index in enumerate((0, STEPS // 2, STEPS)):
-        shift = np.array([APART * place, 0.0, 0.0])
-        for body, color in enumerate(((0.93, 0.55, 0.25), (0.50, 0.66, 0.80), (0.50, 0.66, 0.80))):
-            mesh = sim.mesh(moments[index].state[0], body)
-            mesh.apply_translation(shift)
-            items.append(Item(mesh, color))
-        marks.append(camera.project(moments[0].goal.numpy()[0] + shift))
-    draw_items(axes, items, camera, shadows=False, split=0.3)
-    axes.plot(*np.array(marks)[:, :2].T, "+", ms=12, mew=2.0, color="#0a7d33", zorder=4)
-    axes.set_title("a test target, t = 0, 0.48 and 1 s", fontsize=10, color="0.2")
+    block, sticks = (0.93, 0.55, 0.25), (0.50, 0.66, 0.80)
+    looks = {0: {"color": block}, 1: {"color": sticks}, 2: {"color": sticks}}
+    draw_moments(axes, task, ours, Camera(-84.0, 9.0), APART, looks, split=0.3)
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=0, help="the first (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="how many (default: %(default)s)")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help="of each (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help=f"one seed, {QUICK_EPISODES} episodes, without DDPG")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
-    options = parser.parse_args(argv)
-    begin = time.perf_counter()
-    task, left = build_task()
-    seeds = range(options.seed, options.seed + (1 if options.quick else options.seeds))
-    episodes = min(options.episodes, QUICK_EPISODES) if options.quick else options.episodes
-    ours = by_gradient(task, left, seeds, episodes, RATE)
-    ddpg = None if options.quick else by_ddpg(task, left, seeds, episodes)
-    if not options.no_picture:
-        learnings = [ours] if ddpg is None else [ours, ddpg]
-        draw(learnings, options.out / "learn_sticks.png", lambda axes: draw_scene(axes, task, ours))
-        (options.out / "learn_sticks.json").write_text(json.dumps(summary(learnings)) + "\n")
-    passed = check(task, left, ours, ddpg)
-    print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
-    return 0 if passed else 1
+    return PROGRAM.main(argv, build_task, check, draw_scene)
 
 
 if __name__ == "__main__":

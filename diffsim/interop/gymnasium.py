@@ -46,9 +46,8 @@ class Moment:
     @staticmethod
     def cat(moments: Sequence[Moment]) -> Moment:
         """Several, one after the other along the batch axis."""
-        states = [moment.state.__dict__ for moment in moments]
         return Moment(
-            State(**{name: torch.cat([state[name] for state in states]) for name in states[0]}),
+            State.cat([moment.state for moment in moments]),
             torch.cat([moment.goal for moment in moments]),
             torch.cat([moment.time_left for moment in moments]),
         )
