@@ -48,7 +48,9 @@ def loss_of(sim: ds.Simulator, state: ds.State, **options: Any) -> Callable[...,
     return loss
 
 
-def same_as_eager(run: Callable[..., Tensor], *inputs: Tensor, backend: str = "aot_eager", **more: Tensor) -> None:
+def assert_same_as_eager(
+    run: Callable[..., Tensor], *inputs: Tensor, backend: str = "aot_eager", **more: Tensor
+) -> None:
     leaves = [t.detach().clone().requires_grad_() for t in (*inputs, *more.values())]
     given = leaves[: len(inputs)], dict(zip(more, leaves[len(inputs) :]))
     expected = run(*given[0], **given[1])
@@ -64,7 +66,7 @@ def same_as_eager(run: Callable[..., Tensor], *inputs: Tensor, backend: str = "a
 def test_a_step_and_a_rollout_are_those_of_eager_calls(every: int | None, calls: Calls) -> None:  # noqa: F811
     sim = box_on_sheet()
     state = sim.rollout(sim.initial_state(), steps=3)[-1]
-    same_as_eager(
+    assert_same_as_eager(
         loss_of(sim, state, checkpoint_every=every),
         state.velocity,
         torch.ones_like(state.velocity),
@@ -82,7 +84,7 @@ def test_a_step_and_a_rollout_are_those_of_eager_calls(every: int | None, calls:
 def test_inductor_gives_the_same_bits() -> None:
     sim = two_bodies()
     state = sim.initial_state()
-    same_as_eager(loss_of(sim, state), state.velocity, PUSHED * torch.ones(2, 3).double(), backend="inductor")
+    assert_same_as_eager(loss_of(sim, state), state.velocity, PUSHED * torch.ones(2, 3).double(), backend="inductor")
 
 
 def test_batches_float32_and_parameters_per_scene() -> None:
@@ -90,7 +92,7 @@ def test_batches_float32_and_parameters_per_scene() -> None:
     state = sim.initial_state(batch=2)
     force = torch.ones(1, 3)  # float32 beside float64, and without the batch axis
     masses = torch.stack([sim.mass.detach(), 2.0 * sim.mass.detach()])
-    same_as_eager(loss_of(sim, state), state.velocity, force, mass=masses)
+    assert_same_as_eager(loss_of(sim, state), state.velocity, force, mass=masses)
 
 
 def test_transforms_inside_and_functional_call_keep_working() -> None:

@@ -324,7 +324,7 @@ def test_absurd_speeds_are_answered(name: str) -> None:
 
 def test_a_long_row_lands_in_few_newton_steps() -> None:
     """A symmetric stack lands on a saddle of the energy: its cubes leave it together, not one after the other. Then a
-    dozen contacts of each pair come and go: the impact QP finds those that push, where Newton steps took 18.
+    dozen contacts of each pair come and go: the model of all of them finds those that push, where Newton steps took 18.
     """
     sim = ds.Simulator(scenes.two_layer_stack(150), dt=0.01, on_failure="raise")
     state, iterations = sim.initial_state(), []
