@@ -204,7 +204,7 @@ private:
         m_scratch.passive.tree = build_box_tree(m_scratch.passive_boxes);
     }
 
-    /// A driven body that a static one is in the way of goes as far as there is room. False if there is none.
+    /// Driven bodies that have a static one in their way go as far as there is room. Whether there were any.
     bool stop_at_static_bodies() {
         bool any = false;
         for (const PassiveBody& driven : m_scratch.passive.bodies) {
