@@ -47,15 +47,22 @@ def unit_quaternion(value: Any, where: str) -> FloatArray:
     return np.asarray(q / norm)
 
 
-def unavailable(value: Any, field: str, where: str) -> float:
-    """Friction and restitution: checked as they will be, but only 0 is implemented."""
-    result = number(value, f"{where}: {field}")
-    if result < 0.0 or (field == "restitution" and result > 1.0):
-        expected = "not be negative" if field == "friction" else "lie between 0 and 1"
-        raise ValueError(f"{where}: {field} must {expected}, got {result:g}")
+def coefficient(value: Any, where: str) -> float:
+    """Coulomb's coefficient of friction."""
+    result = number(value, f"{where}: friction")
+    if result < 0.0:
+        raise ValueError(f"{where}: friction must not be negative, got {result:g}")
+    return result
+
+
+def unavailable_restitution(value: Any, where: str) -> float:
+    """Checked as it will be, but only 0 is implemented."""
+    result = number(value, f"{where}: restitution")
+    if not 0.0 <= result <= 1.0:
+        raise ValueError(f"{where}: restitution must lie between 0 and 1, got {result:g}")
     if result != 0.0:
         raise NotImplementedError(
-            f"{where}: {field}={result:g} is not implemented yet: contact is frictionless and inelastic for now; use 0"
+            f"{where}: restitution={result:g} is not implemented yet: contact is inelastic for now; use 0"
         )
     return result
 

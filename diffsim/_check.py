@@ -14,7 +14,7 @@ from .state import Control, State
 # In the order of the core; fields of cloth nodes start with "node".
 STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
 CONTROL_FIELDS = ("force", "torque", "node_force", "body_velocity", "body_angular_velocity", "node_velocity")
-PARAMETERS = ("mass", "inertia", "gravity")
+PARAMETERS = ("mass", "inertia", "gravity", "friction")
 CLOTH_PARAMETERS = ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend", "cloth_damping")
 FLOAT_DTYPES = (torch.float32, torch.float64)
 

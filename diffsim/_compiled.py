@@ -39,7 +39,7 @@ class Owner(Protocol):
     """What a simulator is asked for where an op runs."""
 
     def _make_call(self, steps: int, **settings: Any) -> RolloutCall: ...
-    def _check_unread(self, friction: Tensor, restitution: Tensor) -> None: ...
+    def _check_unread(self, restitution: Tensor) -> None: ...
     def _finish_traced(self, info: Any, first_step: int, outputs: OptionalTensors) -> None: ...
 
 
@@ -98,10 +98,10 @@ def rollout(
     single: bool = False,
     first_step: int = 0,
 ) -> OptionalTensors:
-    """As `diffsim.ops.rollout`, for code that is traced. `values`: the parameters of the call, friction among them."""
+    """As `diffsim.ops.rollout`, for code that is traced. `values`: the parameters of the call, restitution among them."""
     record = keep_tape and torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     settings = (owner, steps, controls_have_time, keep_time, record, single, first_step)
-    outputs = torch.ops.diffsim.rollout(*settings, *inputs, values["friction"], values["restitution"])
+    outputs = torch.ops.diffsim.rollout(*settings, *inputs, values["restitution"])
     moving, nodes = tuple(outputs[:4]), tuple(outputs[4:_OUTPUT_COUNT])
     return (*moving, *nodes) if inputs[4] is not None else (*moving, None, None)
 
@@ -111,7 +111,7 @@ def rollout(
 # By hand and not by torch.library.custom_op: what that makes of a derivative cannot be called inside torch.func.
 _library = torch.library.Library("diffsim", "DEF")
 _library.define(
-    f"rollout({_SETTINGS}, {_INPUTS}, Tensor friction, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})"
+    f"rollout({_SETTINGS}, {_INPUTS}, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})"
 )
 _library.define(f"rollout_backward({_SETTINGS}, bool[] needs, Tensor tape, {_INPUTS}, {_GRADS}) -> Tensor[]")
 
@@ -187,7 +187,7 @@ class _Differentiated(_SingleLevelFunction):
         needs = list(ctx.needs_input_grad[1 + _HEAD : 1 + _HEAD + INPUT_COUNT])
         upstream = grads[:_OUTPUT_COUNT]
         found = iter(torch.ops.diffsim.rollout_backward(*ctx.settings, needs, *ctx.saved_tensors, *upstream))
-        return (*(None,) * (1 + _HEAD), *(next(found) if needed else None for needed in needs), None, None)
+        return (*(None,) * (1 + _HEAD), *(next(found) if needed else None for needed in needs), None)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:

@@ -15,14 +15,14 @@ from ._outcome import gradient_error
 
 OptionalTensors = tuple[Tensor | None, ...]
 
-# The inputs of a call: state, controls, then mass, inertia, gravity and the five of cloth.
+# The inputs of a call: state, controls, then mass, inertia, gravity, friction and the five of cloth.
 INPUT_NAMES = (
     *(f"state.{name}" for name in STATE_FIELDS),
     *(f"control.{name}" for name in CONTROL_FIELDS),
     *PARAMETERS,
     *CLOTH_PARAMETERS,
 )
-BASE_NDIM = (*(2,) * 6, *(2,) * 6, 1, 3, 1, *(1,) * 5)  #: of each, without time and batch
+BASE_NDIM = (*(2,) * 6, *(2,) * 6, 1, 3, 1, 1, *(1,) * 5)  #: of each, without time and batch
 INPUT_COUNT = len(BASE_NDIM)
 CONTROLS = range(6, 12)  #: which of them may have a time axis
 

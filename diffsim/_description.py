@@ -41,7 +41,8 @@ def stages(packed: PackedScene) -> tuple[list[str], list[str]]:
     nothing_moves = None if has_cloth else none_moves
     stage("ground contact", nothing_moves if packed.has_ground else "no ground")
     stage("body-body contact", none_moves or (None if n > 1 else "one body"))
-    stage("friction", "not in this version")
+    rubbing = np.count_nonzero(packed.friction)
+    stage("friction", nothing_moves or (None if rubbing > 1 else "no two objects with friction"))
     stage("restitution", "not in this version")
     no_cloth = None if has_cloth else "no cloth"
     stage("cloth", no_cloth)

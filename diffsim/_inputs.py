@@ -23,7 +23,7 @@ from ._check import (
 from .state import Control, State
 
 Controls = Control | Sequence[Control] | None
-#: Of the operator: 6 of the state, 6 of the control, 8 parameters; those of cloth are None in a scene without.
+#: Of the operator: 6 of the state, 6 of the control, 9 parameters; those of cloth are None in a scene without.
 Inputs = tuple[Tensor | None, ...]
 
 
@@ -57,6 +57,7 @@ def plain_inputs(
     position, orientation = state.position, state.orientation
     velocity, angular_velocity = state.velocity, state.angular_velocity
     mass, inertia, gravity = parameters["mass"], parameters["inertia"], parameters["gravity"]
+    friction = parameters["friction"]
     try:
         if position.shape != vector:
             if position.ndim != 3:
@@ -71,6 +72,7 @@ def plain_inputs(
             and mass.dtype is f64
             and inertia.dtype is f64
             and gravity.dtype is f64
+            and friction.dtype is f64
             and position.shape == vector
             and orientation.shape == quaternion
             and velocity.shape == vector
@@ -78,6 +80,7 @@ def plain_inputs(
             and mass.shape == parameter_shapes["mass"]
             and inertia.shape == parameter_shapes["inertia"]
             and gravity.shape == parameter_shapes["gravity"]
+            and friction.shape == parameter_shapes["friction"]
             and position.is_cpu
             and orientation.is_cpu
             and velocity.is_cpu
@@ -85,6 +88,7 @@ def plain_inputs(
             and mass.is_cpu
             and inertia.is_cpu
             and gravity.is_cpu
+            and friction.is_cpu
             and state.node_position.shape == nodes
             and state.node_velocity.shape == nodes
         ):
@@ -101,7 +105,7 @@ def plain_inputs(
     except AttributeError:  # not a tensor
         return None
     moving = position, orientation, velocity, angular_velocity, None, None
-    return *moving, *driven, mass, inertia, gravity, None, None, None, None, None
+    return *moving, *driven, mass, inertia, gravity, friction, None, None, None, None, None
 
 
 def checked_inputs(

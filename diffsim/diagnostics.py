@@ -282,6 +282,8 @@ def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps:
     """All that can be moved, in float64 and without history; controls with a time axis if they are a sequence."""
     start = state.detach().to(torch.float64)
     fields, parameters = list(STATE_FIELDS), list(PARAMETERS)
+    if not bool(sim.friction.any()):
+        parameters.remove("friction")  # it moves in proportion, and is not there
     if sim._node_count:
         parameters += CLOTH_PARAMETERS
     else:
@@ -314,7 +316,7 @@ def _direction(name: str, inputs: dict[str, Tensor], sim: Simulator, generator: 
     if name == "orientation":
         unit = torch.nn.functional.normalize(value, dim=-1)
         return direction - (direction * unit).sum(-1, keepdim=True) * unit
-    if name == "mass" or name in CLOTH_PARAMETERS:
+    if name in ("mass", "friction", *CLOTH_PARAMETERS):
         return _PARAMETER_STEP * value * direction
     if name == "inertia":
         return _PARAMETER_STEP * _mean_inertia(value)[..., None, None] * 0.5 * (direction + direction.mT)

@@ -159,6 +159,7 @@ def rollout(
     mass: Tensor,
     inertia: Tensor,
     gravity: Tensor,
+    friction: Tensor,
     cloth_density: Tensor | None,
     cloth_stretch: Tensor | None,
     cloth_shear: Tensor | None,
@@ -187,6 +188,7 @@ def rollout(
         mass: [kg], shape (n,).
         inertia: Body frame [kg·m²], shape (n, 3, 3).
         gravity: [m/s²], shape (3,).
+        friction: Coulomb's coefficients of bodies, cloths and the ground [1], shape (n_objects,).
         cloth_density: [kg/m²], shape (n_cloths,).
         cloth_stretch: [N/m], shape (n_cloths,).
         cloth_shear: [N/m], shape (n_cloths,).
@@ -213,6 +215,7 @@ def rollout(
         mass,
         inertia,
         gravity,
+        friction,
         cloth_density,
         cloth_stretch,
         cloth_shear,

@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from ._arguments import KINDS, Kind, body_kind, finite_array, number, positive, unavailable, unit_quaternion
+from ._arguments import (
+    KINDS,
+    Kind,
+    body_kind,
+    coefficient,
+    finite_array,
+    number,
+    positive,
+    unavailable_restitution,
+    unit_quaternion,
+)
 from ._body_shape import Shape, mesh_shape, round_shape
 from ._cloth_shape import cloth_shape
 from ._handles import BodyCount, BodyHandle, ClothHandle
@@ -53,7 +63,7 @@ class Scene:
 
         Args:
             height: [m]
-            friction: 0, as for `add_body`.
+            friction: Coulomb's coefficient μ, as for `add_body`.
             restitution: 0, as for `add_body`.
             margin: Distance of the collision surface above `height` [m]. Default: half the thickness of what meets it.
         Raises: ValueError, NotImplementedError as `add_body`; ValueError for a second ground.
@@ -62,8 +72,8 @@ class Scene:
             raise ValueError(f"ground: the scene already has a ground, at height {self._ground.height:g} m")
         self._ground = Ground(
             height=number(height, "ground: height"),
-            friction=unavailable(friction, "friction", "ground"),
-            restitution=unavailable(restitution, "restitution", "ground"),
+            friction=coefficient(friction, "ground"),
+            restitution=unavailable_restitution(restitution, "ground"),
             margin=None if margin is None else positive(margin, "ground: margin", "m"),
         )
 
@@ -106,7 +116,7 @@ class Scene:
             velocity: Of the centre of mass, world, shape (3,) [m/s].
             angular_velocity: World, shape (3,) [rad/s].
             kind: "dynamic", "static" (never moves) or "kinematic" (moves as told, pushes others, is not pushed).
-            friction: 0; contact is frictionless for now.
+            friction: Coulomb's coefficient μ, not negative; of two objects in contact the geometric mean acts.
             restitution: 0; contact is inelastic for now.
             margin: Distance of the collision surface from the mesh [m]. Default: half of the body's thickness, see
                 `pack`.
@@ -118,7 +128,7 @@ class Scene:
             ValueError: What the error names: a degenerate or open mesh, a value out of range, a name already in use.
             TypeError: An argument of the wrong type.
             FileNotFoundError: The mesh's file.
-            NotImplementedError: Friction or restitution other than 0.
+            NotImplementedError: Restitution other than 0.
         Warns: UnitsWarning, once per scene, of a dynamic body or a cloth longer than 100 m or shorter than 0.1 mm, or a
             dynamic body of less than 5 kg/m³: most of these are slips of units.
         """
@@ -235,7 +245,7 @@ class Scene:
             margin: Distance of the collision surface from the mesh, to both sides [m]: half of the cloth's thickness.
                 Default: half of the simulator's thickness, or of its own, see `pack`.
             scale: Metres in a unit of the mesh, and of `rest`, as for `add_body`.
-            friction: 0, as for `add_body`.
+            friction: Coulomb's coefficient μ, as for `add_body`.
             restitution: 0, as for `add_body`.
             name: For error messages and pictures, unique. Default: "cloth_" and its index.
         Returns: A handle with the cloth's slice of the node axis, and its indices.
@@ -243,7 +253,7 @@ class Scene:
             ValueError: What the error names: a mesh that is no sheet, a pinned node out of range, a name in use.
             TypeError: An argument of the wrong type.
             FileNotFoundError: The mesh's file.
-            NotImplementedError: Friction or restitution other than 0.
+            NotImplementedError: Restitution other than 0.
         Warns: UnitsWarning, as `add_body`.
         """
         where, name = self._name(name, "cloth", len(self._cloths))
@@ -260,8 +270,8 @@ class Scene:
             orientation=unit_quaternion(orientation, where),
             velocity=finite_array(velocity, f"{where}: velocity", (3,)),
             margin=None if margin is None else positive(margin, f"{where}: margin", "m"),
-            friction=unavailable(friction, "friction", where),
-            restitution=unavailable(restitution, "restitution", where),
+            friction=coefficient(friction, where),
+            restitution=unavailable_restitution(restitution, where),
         )
         self._warn_of_units(size_slip(where, float(np.ptp(cloth.shape.rest, axis=0).max()), _SCALE_MEND), 3)
         first = sum(len(c.shape.vertices) for c in self._cloths)
@@ -372,8 +382,8 @@ class Scene:
             orientation=unit_quaternion(orientation, where),
             velocity=finite_array(velocity, f"{where}: velocity", (3,)),
             angular_velocity=finite_array(angular_velocity, f"{where}: angular_velocity", (3,)),
-            friction=unavailable(friction, "friction", where),
-            restitution=unavailable(restitution, "restitution", where),
+            friction=coefficient(friction, where),
+            restitution=unavailable_restitution(restitution, where),
         )
         if kind == "static":
             for field in ("velocity", "angular_velocity"):

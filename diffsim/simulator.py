@@ -161,7 +161,7 @@ class Simulator(SceneIdentity, Measurements):
         self._num_threads = num_threads
         self._on_failure = on_failure
         self._check = check
-        for name in (*PARAMETERS, "friction", "restitution", *CLOTH_PARAMETERS):
+        for name in (*PARAMETERS, "restitution", *CLOTH_PARAMETERS):
             value = torch.from_numpy(np.array(getattr(self._packed, name), dtype=np.float64))
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
         self._info: Info | list[Any] | None = None  # a list of the core's, one per segment, until someone asks
@@ -178,7 +178,7 @@ class Simulator(SceneIdentity, Measurements):
         n = self._body_count = len(p.names)
         self._node_count = len(p.node_rest)
         self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
-        names = (*PARAMETERS, "friction", "restitution", *CLOTH_PARAMETERS)
+        names = (*PARAMETERS, "restitution", *CLOTH_PARAMETERS)
         self._parameter_shapes = {name: torch.Size(getattr(p, name).shape) for name in names}
         self._object_names = (*p.names, *p.cloth_names)
         self._cloth_of_node = torch.from_numpy(np.repeat(np.arange(len(p.node_count)), p.node_count))
@@ -283,7 +283,7 @@ class Simulator(SceneIdentity, Measurements):
         if traced:
             return state_from(_compiled.rollout(self._number, inputs, values, 1, single=single), state)
         if self._check:
-            self._check_unread(values["friction"], values["restitution"])
+            self._check_unread(values["restitution"])
         call = self._make_call(1, single=single)
         outputs = rollout(call, *inputs)  # type: ignore[arg-type]
         result = state_from(outputs, state)
@@ -342,7 +342,7 @@ class Simulator(SceneIdentity, Measurements):
         inputs, has_time, single = self._checked_inputs(where, state, controls, steps, values)
         traced = torch.compiler.is_compiling()
         if self._check and not traced:
-            self._check_unread(values["friction"], values["restitution"])
+            self._check_unread(values["restitution"])
         now, driven, constant = inputs[:6], inputs[6:12], inputs[12:]
         segments, infos, signatures = [], [], []
         with progress_bar(steps, progress and not traced) as advance:
@@ -395,7 +395,7 @@ class Simulator(SceneIdentity, Measurements):
         values = self._values("contacts", parameters)
         inputs, _, single = self._checked_inputs("contacts", state, control, None, values)
         if self._check:
-            self._check_unread(values["friction"], values["restitution"])
+            self._check_unread(values["restitution"])
         call = self._make_call(1, single=single, want_contacts=True)
         end = state_from(rollout(call, *inputs), state)  # type: ignore[arg-type]
         self._finish([call.info], end)
@@ -426,9 +426,8 @@ class Simulator(SceneIdentity, Measurements):
         threads = self._num_threads or torch.get_num_threads()
         return RolloutCall(self._model, self._options, steps, threads, **settings)
 
-    def _check_unread(self, friction: Tensor, restitution: Tensor) -> None:
-        for name, value in (("friction", friction), ("restitution", restitution)):
-            check_unused(name, value, self._parameter_shapes[name], self._object_names)
+    def _check_unread(self, restitution: Tensor) -> None:
+        check_unused("restitution", restitution, self._parameter_shapes["restitution"], self._object_names)
 
     def _finish(self, segments: list[Any], result: State) -> None:
         """Keeps the statistics of the call, and warns or raises if a step did not converge."""

@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "adjoint/contact_term.hpp"
+#include "adjoint/friction_adjoint.hpp"
 #include "adjoint/linearised_zone.hpp"
 #include "math/rotation.hpp"
 #include "zone/chart.hpp"
@@ -177,10 +178,17 @@ struct Multipliers {
 };
 
 /// Overwrite the multiplier of the workspace's result, the upstream gradient, by z.
-Multipliers solve_exactly(const Zone& zone, const ZonePoint& point, AdjointWorkspace& workspace) {
+Multipliers solve_exactly(
+    const Zone& zone, const ZonePoint& point, FrictionAdjoint& friction, AdjointWorkspace& workspace) {
     BlockSystem& system = workspace.system;
     system.set_pattern(base_pattern(zone));
     differentiate(zone, point, Curvature::full, workspace.derivatives, &system);
+    if (!friction.empty()) {
+        if (friction.solve(system, workspace.result.multiplier)) return {};
+        differentiate(zone, point, Curvature::full, workspace.derivatives, &system, kAllCut);
+        friction.solve(system, workspace.result.multiplier);
+        return {};
+    }
     if (!system.factorize()) {
         // Only where the forward stopped short of a minimum. Without negative curvature the answer stays finite.
         differentiate(zone, point, Curvature::full, workspace.derivatives, &system, kAllCut);
@@ -207,6 +215,8 @@ void start_result(const Zone& zone, const Coordinates& upstream, ZoneAdjoint& re
     for (int i = 0; i < zone.node_count(); ++i)
         if (zone.nodes[i].pinned) result.multiplier.nodes[i].setZero();
     result.pose_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
+    result.drive_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
+    result.friction_gradient.clear();
     result.start_gradient.assign(zone.nodes.size(), Vec3::Zero());
     result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
     result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
@@ -216,16 +226,25 @@ void start_result(const Zone& zone, const Coordinates& upstream, ZoneAdjoint& re
 }  // namespace
 
 const ZoneAdjoint& zone_adjoint(
-    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
-    AdjointWorkspace& workspace) {
+    const Zone& zone, const ZonePoint& point, const std::vector<ContactFriction>& friction, const Coordinates& upstream,
+    AdjointMode mode, const GradientNeeds& needs, AdjointWorkspace& workspace) {
     const bool exact = mode == AdjointMode::exact;
     ZoneDerivatives& derivatives = workspace.derivatives;
     ZoneAdjoint& result = workspace.result;
     std::vector<Vec6>& twist = workspace.twist;
     start_result(zone, upstream, result);
+    FrictionAdjoint friction_adjoint(zone, point, friction);
     const Multipliers multipliers =
-        exact ? solve_exactly(zone, point, workspace) : solve_linearised(zone, point, mode, result);
-    add_bodies(zone, point, upstream, exact ? &derivatives.torque : nullptr, needs, twist, result);
+        exact ? solve_exactly(zone, point, friction_adjoint, workspace) : solve_linearised(zone, point, mode, result);
+    const auto add_bodies_for = [&](const Coordinates& v) {
+        add_bodies(zone, point, v, exact ? &derivatives.torque : nullptr, needs, twist, result);
+    };
+    if (friction_adjoint.empty()) {
+        add_bodies_for(upstream);
+    } else {
+        add_bodies_for(friction_adjoint.left_by_friction(upstream, result.multiplier));
+        friction_adjoint.add_gradients(result.multiplier, result);
+    }
     if (needs.mass && !zone.exact_contact) {
         if (!exact) differentiate(zone, point, Curvature::none, derivatives, nullptr);
         add_body_stiffness(zone, derivatives.pair_sums, twist, result);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include "contact/friction.hpp"
 #include "zone/zone_derivatives.hpp"
 
 /// Backward of a zone: implicit differentiation of its optimality condition dE/dy = 0, not of the iterations.
@@ -26,6 +27,15 @@ struct ZoneAdjoint {
     /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone, those
     /// that do not yield included, along its twist at the end of the step; one per node.
     Coordinates pose_gradient;
+    /// Through slips, when what moves as told goes further and ends where it did: one per body that does not yield and
+    /// pinned node, along its motion.
+    Coordinates drive_gradient;
+    /// Of one object's coefficient of friction, through one contact.
+    struct FrictionPart {
+        int object;  ///< numbered as Parameters::friction
+        double value;
+    };
+    std::vector<FrictionPart> friction_gradient;
     std::vector<Vec3> start_gradient;             ///< one per node: through the strains that damping is measured from
     std::vector<double> mass_gradient;            ///< through the contacts' stiffness, one per dynamic body
     std::vector<double> node_mass_gradient;       ///< the same, one per node
@@ -40,10 +50,11 @@ struct AdjointWorkspace {
     ZoneAdjoint result;
 };
 
-/// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution. `upstream` has one
+/// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution. `friction`: of the
+/// active contacts, empty in a zone without; in mode exact only, and not of exact contacts. `upstream` has one
 /// entry per dynamic body and node; those of pinned nodes are not used. The result is the workspace's, until its next use.
 const ZoneAdjoint& zone_adjoint(
-    const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode, const GradientNeeds& needs,
-    AdjointWorkspace& workspace);
+    const Zone& zone, const ZonePoint& point, const std::vector<ContactFriction>& friction, const Coordinates& upstream,
+    AdjointMode mode, const GradientNeeds& needs, AdjointWorkspace& workspace);
 
 }  // namespace diffsim

@@ -1,19 +1,14 @@
 #include "adjoint/contact_term.hpp"
 
-#include "zone/sides_of.hpp"
-
 namespace diffsim {
 namespace {
-
-void set(ContactTerm::Side& side, const PlacedSide<BodySide>& placed) { side.body = placed.body; }
-void set(ContactTerm::Side& side, const PlacedSide<ClothSide>& placed) { side.nodes = placed.nodes; }
 
 template <class A, class B>
 void fill(
     const ContactLaw& law, const ContactGeometry& geometry, Curvature curvature, const PlacedSide<A>& a,
     const PlacedSide<B>& b, ContactTerm& term) {
-    set(term.sides[0], a);
-    set(term.sides[1], b);
+    set_side(term.sides[0], a);
+    set_side(term.sides[1], b);
     term.sides[1].offset = A::kSize;
     const bool with_hessian = curvature != Curvature::none;
     const auto d = contact_derivatives(geometry, law, a.side, b.side, with_hessian, curvature != Curvature::dropped);
@@ -27,7 +22,7 @@ void fill(
     const ContactLaw& law, const ContactGeometry& geometry, Curvature, const PlacedSide<BodySide>& a,
     const PlacedSide<GroundSide>&, ContactTerm& term) {
     term.side_count = 1;
-    set(term.sides[0], a);
+    set_side(term.sides[0], a);
     term.row = GroundSums::row(geometry.closest.a.point - a.side.center);
     term.stiffness = normal_force(law, geometry.distance).stiffness;
 }
@@ -36,7 +31,7 @@ void fill(
     const ContactLaw& law, const ContactGeometry& geometry, Curvature, const PlacedSide<ClothSide>& a,
     const PlacedSide<GroundSide>&, ContactTerm& term) {
     term.side_count = 1;
-    set(term.sides[0], a);
+    set_side(term.sides[0], a);
     const PotentialValue potential = normal_force(law, geometry.distance);
     term.row = Vec3::UnitZ();
     term.gradient = -potential.force * term.row;

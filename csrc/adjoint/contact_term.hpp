@@ -1,5 +1,6 @@
 #pragma once
 
+#include "zone/sides_of.hpp"
 #include "zone/zone_derivatives.hpp"
 
 /// What the backward of a zone needs of each active contact.
@@ -8,6 +9,22 @@ namespace diffsim {
 /// Vectors and matrices of up to two features of cloth, on the stack.
 using SmallVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, 18, 1>;
 using SmallMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, 18, 18>;
+
+/// Call body_part(body, offset) and node_part(node, offset) for everything on the sides of a term.
+template <class Side, class BodyPart, class NodePart>
+void visit_sides(const std::array<Side, 2>& sides, int count, const BodyPart& body_part, const NodePart& node_part) {
+    for (int s = 0; s < count; ++s) {
+        const Side& side = sides[static_cast<std::size_t>(s)];
+        if (side.body >= 0) {
+            body_part(side.body, side.offset);
+            continue;
+        }
+        for (int k = 0; k < 3; ++k) {
+            const int node = side.nodes[static_cast<std::size_t>(k)];
+            if (node >= 0) node_part(node, side.offset + 3 * k);
+        }
+    }
+}
 
 /// The derivatives of an active contact and what they are taken along: one or two objects, each a body's twist (6) or the
 /// nodes of a cloth's feature (9).
@@ -26,19 +43,13 @@ struct ContactTerm {
     /// Call body_part(body, offset) and node_part(node, offset) for everything the term is taken along.
     template <class BodyPart, class NodePart>
     void for_each(const BodyPart& body_part, const NodePart& node_part) const {
-        for (int s = 0; s < side_count; ++s) {
-            const Side& side = sides[static_cast<std::size_t>(s)];
-            if (side.body >= 0) {
-                body_part(side.body, side.offset);
-                continue;
-            }
-            for (int k = 0; k < 3; ++k) {
-                const int node = side.nodes[static_cast<std::size_t>(k)];
-                if (node >= 0) node_part(node, side.offset + 3 * k);
-            }
-        }
+        visit_sides(sides, side_count, body_part, node_part);
     }
 };
+
+inline void set_side(ContactTerm::Side& side, const PlacedSide<BodySide>& placed) { side.body = placed.body; }
+inline void set_side(ContactTerm::Side& side, const PlacedSide<ClothSide>& placed) { side.nodes = placed.nodes; }
+inline void set_side(ContactTerm::Side&, const PlacedSide<GroundSide>&) {}
 
 /// The derivatives of one active contact. Curvature::none leaves the Hessian unset, which of a body on the ground it
 /// always is.

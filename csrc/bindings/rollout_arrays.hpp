@@ -13,7 +13,7 @@ namespace diffsim::bindings {
 
 using Shape = std::vector<py::ssize_t>;
 
-constexpr std::size_t kInputCount = 20, kOutputCount = 6;
+constexpr std::size_t kInputCount = 21, kOutputCount = 6;
 using InputArrays = std::array<OptionalArray, kInputCount>;    // in the order of RolloutArrays
 using OutputArrays = std::array<OptionalArray, kOutputCount>;  // in the order of TrajectoryArrays
 
@@ -56,6 +56,7 @@ inline Fields input_fields(const Model& model) {
          {"mass", {n}, false},
          {"inertia", {n, 3, 3}, false},
          {"gravity", {3}, false},
+         {"friction", {model.object_count()}, false},
          {"cloth_density", {cloths}, false},
          {"cloth_stretch", {cloths}, false},
          {"cloth_shear", {cloths}, false},
@@ -81,6 +82,7 @@ std::array<BatchedView<T>*, kInputCount> members(RolloutArrays<T>& arrays) {
         &arrays.mass,
         &arrays.inertia,
         &arrays.gravity,
+        &arrays.friction,
         &arrays.cloth_density,
         &arrays.cloth_stretch,
         &arrays.cloth_shear,

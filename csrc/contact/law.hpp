@@ -32,7 +32,9 @@ ContactStiffness contact_stiffness(double mass_a, double mass_b, double complian
 struct ContactLaw {
     ContactRange range;
     ContactStiffness stiffness;
-    double shift = 0.0;  ///< of range.rest, so that an exact contact's force acts at its rest distance [m]
+    double shift = 0.0;         ///< of range.rest, so that an exact contact's force acts at its rest distance [m]
+    double friction = 0.0;      ///< Coulomb's coefficient μ [1]
+    double margin_share = 0.5;  ///< of a's margin in the sum of both: where between them the surfaces meet [1]
 };
 
 /// Energy of a contact at this distance, and its derivatives with respect to the compression below the rest distance.

@@ -42,6 +42,8 @@ struct Model {
 
     int body_count() const { return static_cast<int>(bodies.size()); }
     int cloth_count() const { return static_cast<int>(cloths.size()); }
+    /// Bodies, cloths and the ground.
+    int object_count() const { return body_count() + cloth_count() + (ground.present ? 1 : 0); }
     int node_count() const { return cloths.empty() ? 0 : cloths.back().first_node + cloths.back().node_count(); }
 
     // Objects are the bodies, then the cloths, or kGround.
@@ -85,6 +87,7 @@ struct Parameters {
     std::vector<Mat3> inertia;    ///< body frame, symmetric [kg·m²]
     Vec3 gravity = Vec3::Zero();  ///< [m/s²]
     std::vector<ClothParameters> cloths;
+    std::vector<double> friction;  ///< μ of each object: bodies, cloths, then the ground; empty where there is none [1]
 };
 
 }  // namespace diffsim

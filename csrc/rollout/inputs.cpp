@@ -67,6 +67,25 @@ double read_cloth_parameter(
     throw std::invalid_argument(text.str());
 }
 
+/// Left empty where there is none, so that nothing asks for it.
+void read_friction(const Model& model, const RolloutInputs& in, int scene, Parameters& parameters) {
+    const int count = model.object_count();
+    if (count == 0) return;
+    const double* values = in.friction.at(0, scene);
+    bool any = false;
+    for (int i = 0; i < count; ++i) {
+        if (!(values[i] >= 0.0) || !std::isfinite(values[i])) {
+            const bool is_ground = i == model.body_count() + model.cloth_count();
+            std::ostringstream text;
+            text << "friction of '" << (is_ground ? "ground" : model.name(i)) << "' (index " << i
+                 << ") must be zero or positive and finite, got " << values[i];
+            throw std::invalid_argument(text.str());
+        }
+        any = any || values[i] > 0.0;
+    }
+    if (any) parameters.friction.assign(values, values + count);
+}
+
 }  // namespace
 
 SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
@@ -127,6 +146,7 @@ Parameters read_parameters(const Model& model, const RolloutInputs& in, int scen
         if (!parameters.inertia[i].allFinite() || parameters.inertia[i].llt().info() != Eigen::Success)
             refuse("inertia", model, i, "must be positive definite, got (" + text_of(given) + ") kg·m²");
     }
+    read_friction(model, in, scene, parameters);
     for (int i = 0; i < model.cloth_count(); ++i) {
         ClothParameters cloth;
         cloth.density = read_cloth_parameter("cloth_density", "kg/m²", false, model, in.cloth_density, i, scene);

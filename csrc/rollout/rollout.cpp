@@ -62,6 +62,18 @@ RolloutInfo merged(const std::vector<RolloutInfo>& scenes) {
     return total;
 }
 
+/// Before a forward that is recorded for one.
+void refuse_gradient_of_friction(const Options& options, const Parameters& parameters) {
+    if (parameters.friction.empty()) return;
+    if (options.adjoint != AdjointMode::exact)
+        throw std::invalid_argument(
+            "adjoint='qr' and 'dense' linearise contact without friction, as the paper does; with friction gradients "
+            "take adjoint='exact'");
+    if (options.compliance == 0.0)
+        throw std::invalid_argument(
+            "there are no gradients of friction on hard contacts (compliance=0); give contacts a compliance, 1e-6 say");
+}
+
 }  // namespace
 
 std::size_t Tape::bytes() const {
@@ -89,6 +101,7 @@ RolloutInfo rollout(
         SceneState state = read_state(*model, inputs, scene);
         refuse_crossing(*model, state);
         const Parameters parameters = read_parameters(*model, inputs, scene);
+        if (tape != nullptr) refuse_gradient_of_friction(options, parameters);
         SceneControl control;
         RolloutInfo& info = infos[scene];
         for (int time = 0; time < shape.steps; ++time) {

@@ -27,8 +27,8 @@ struct RolloutArrays {
     BatchedView<T> position, orientation, velocity, angular_velocity, node_position, node_velocity;
     // Controls: n x 3, n x 3, k x 3; n x 3, n x 3, k x 3. The drive is the velocity of pinned nodes.
     BatchedView<T> force, torque, node_force, body_velocity, body_angular_velocity, node_drive;
-    // Parameters: n, n x 3 x 3, 3; one per cloth.
-    BatchedView<T> mass, inertia, gravity;
+    // Parameters: n, n x 3 x 3, 3; one per object; one per cloth.
+    BatchedView<T> mass, inertia, gravity, friction;
     BatchedView<T> cloth_density, cloth_stretch, cloth_shear, cloth_bend, cloth_damping;
 };
 using RolloutInputs = RolloutArrays<const double>;

@@ -79,6 +79,7 @@ SceneGradient scene_backward(
     gradient.parameters.mass.assign(count, 0.0);
     gradient.parameters.inertia.assign(count, Mat3::Zero());
     gradient.parameters.cloths.assign(model.cloths.size(), ClothParameters{});
+    gradient.parameters.friction.assign(parameters.friction.size(), 0.0);
     SceneControl control;
     SceneControlGradient scratch;
     const std::vector<StepRecord>& records = tape.records[scene];
@@ -174,6 +175,8 @@ void write_gradient(
         }
     }
     if (out.gravity.present()) row<3>(out.gravity.at(0, scene), 0) += gradient.parameters.gravity;
+    for (std::size_t i = 0; out.friction.present() && i < gradient.parameters.friction.size(); ++i)
+        out.friction.at(0, scene)[i] += gradient.parameters.friction[i];
     write_cloth_gradient(*tape.model, out, scene, gradient);
 }
 
@@ -214,6 +217,8 @@ public:
             if (wanted.inertia.present()) look("inertia", i, gradient.inertia[i]);
         }
         if (wanted.gravity.present()) look("gravity", kNobody, gradient.gravity);
+        for (std::size_t i = 0; wanted.friction.present() && i < gradient.friction.size(); ++i)
+            look("friction", is_ground(i) ? kGround : static_cast<int>(i), Vector<1>(gradient.friction[i]));
         for (int c = 0; c < m_model.cloth_count(); ++c) {
             const ClothParameters& g = gradient.cloths[c];
             const int object = m_model.body_count() + c;
@@ -223,6 +228,10 @@ public:
             if (wanted.cloth_bend.present()) look("cloth_bend", object, Vector<1>(g.bend));
             if (wanted.cloth_damping.present()) look("cloth_damping", object, Vector<1>(g.damping));
         }
+    }
+
+    bool is_ground(std::size_t object) const {
+        return static_cast<int>(object) == m_model.body_count() + m_model.cloth_count();
     }
 
     bool any() const { return !m_fault.gradients.empty(); }

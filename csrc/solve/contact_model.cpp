@@ -11,18 +11,6 @@ constexpr int kFullSteps = 8;
 constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
 constexpr double kSideTolerance = 1e-9;  // of the contact's range: nearer than this a row is on neither side
 
-double dot(const Coordinates& a, const Coordinates& b) {
-    double sum = 0.0;
-    for (std::size_t i = 0; i < a.bodies.size(); ++i) sum += a.bodies[i].dot(b.bodies[i]);
-    for (std::size_t i = 0; i < a.nodes.size(); ++i) sum += a.nodes[i].dot(b.nodes[i]);
-    return sum;
-}
-
-void add(double factor, const Coordinates& a, Coordinates& sum) {
-    for (std::size_t i = 0; i < a.bodies.size(); ++i) sum.bodies[i] += factor * a.bodies[i];
-    for (std::size_t i = 0; i < a.nodes.size(); ++i) sum.nodes[i] += factor * a.nodes[i];
-}
-
 /// Minimise the convex piecewise quadratic t -> m(p + t s) for t > 0: Newton with bisection as its guard.
 double exact_line_search(
     const std::vector<double>& violation, const std::vector<double>& slope, const std::vector<ContactRow>& rows,
@@ -68,25 +56,23 @@ void add_node_stiffness(const ContactRow& row, double stiffness, BlockSystem& sy
 
 /// What the rows of two bodies do to them together.
 void add_run(
-    const ContactRow& row, const Vector<9>& force, const Square<9>& stiffness, Coordinates& gradient,
-    BlockSystem& system) {
+    const ContactRow& row, const Vector<9>& force, const HalfSymmetric<9>& stiffness, Coordinates& gradient,
+    BlockSystem* system) {
     const Vector<12> forces = both_twists(force);
-    const Square<12> blocks = both_twists(stiffness);
-    if (row.a >= 0) {
-        gradient.bodies[row.a] -= forces.head<6>();
-        system.diagonal(row.a) += blocks.topLeftCorner<6, 6>();
-    }
-    if (row.b >= 0) {
-        gradient.bodies[row.b] -= forces.tail<6>();
-        system.diagonal(row.b) += blocks.bottomRightCorner<6, 6>();
-    }
-    if (row.a >= 0 && row.b >= 0) system.off_diagonal(row.pair) += blocks.topRightCorner<6, 6>();
+    if (row.a >= 0) gradient.bodies[row.a] -= forces.head<6>();
+    if (row.b >= 0) gradient.bodies[row.b] -= forces.tail<6>();
+    if (system == nullptr) return;
+    const Square<12> blocks = both_twists(stiffness.whole());
+    if (row.a >= 0) system->diagonal(row.a) += blocks.topLeftCorner<6, 6>();
+    if (row.b >= 0) system->diagonal(row.b) += blocks.bottomRightCorner<6, 6>();
+    if (row.a >= 0 && row.b >= 0) system->off_diagonal(row.pair) += blocks.topRightCorner<6, 6>();
 }
 
-/// Add the rows that push to gradient and matrix.
+}  // namespace
+
 void add_rows(
     const std::vector<ContactRow>& rows, double share, const std::vector<double>& violation,
-    const std::vector<char>& pushes, Coordinates& gradient, BlockSystem& system) {
+    const std::vector<char>& pushes, Coordinates& gradient, BlockSystem* system) {
     visit_runs(rows, [&](std::size_t first, std::size_t last) {
         bool any = false;
         Vector<9> force = Vector<9>::Zero();
@@ -97,16 +83,14 @@ void add_rows(
             const double k = share * row.stiffness, push = k * violation[r];
             any = true;
             force += push * row.relative;
-            stiffness.add_square(k, row.relative);
+            if (system != nullptr) stiffness.add_square(k, row.relative);
             if (row.nodes.empty()) continue;
             for (std::size_t n = 0; n < row.nodes.size(); ++n) gradient.nodes[row.nodes[n]] -= push * row.node_rows[n];
-            add_node_stiffness(row, k, system);
+            if (system != nullptr) add_node_stiffness(row, k, *system);
         }
-        if (any) add_run(rows[first], force, stiffness.whole(), gradient, system);
+        if (any) add_run(rows[first], force, stiffness, gradient, system);
     });
 }
-
-}  // namespace
 
 ModelSolution minimise(
     ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& w, Coordinates& p) {
@@ -131,7 +115,7 @@ ModelSolution minimise(
         system.copy_values(model.smooth);
         w.gradient = w.smooth_p;
         add(1.0, model.gradient, w.gradient);
-        add_rows(rows, share, w.violation, w.pushes, w.gradient, system);
+        add_rows(rows, share, w.violation, w.pushes, w.gradient, &system);
         if (!system.factorize()) return result;
         ++result.newton_steps;
         w.step = w.gradient;

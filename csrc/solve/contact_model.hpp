@@ -1,15 +1,16 @@
 #pragma once
 
-#include "zone/contact_row.hpp"
+#include "zone/friction_row.hpp"
 
 /// The convex model of a zone around its current point, all near contacts in it:
 ///     m(p) = ½ pᵀ H p + gᵀ p + Σ stiffness/2 max(0, missing - rowᵀ p)².
 namespace diffsim {
 
 struct ContactModel {
-    BlockSystem smooth;            ///< H; its pattern has the rows' pairs
-    Coordinates gradient;          ///< g; zero at pinned nodes
-    std::vector<ContactRow> rows;  ///< one-sided; those of the same bodies follow each other
+    BlockSystem smooth;                 ///< H; its pattern has the rows' pairs
+    Coordinates gradient;               ///< g; zero at pinned nodes
+    std::vector<ContactRow> rows;       ///< one-sided; those of the same bodies follow each other
+    std::vector<FrictionRow> friction;  ///< of rows whose contacts have some, in their order; see friction_model
 };
 
 /// Memory of minimise(), kept from model to model.
@@ -31,5 +32,10 @@ struct ModelSolution {
 ModelSolution minimise(
     ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& workspace,
     Coordinates& p);
+
+/// Add the rows that push, with this share of their stiffness, to the gradient and, unless it is null, the matrix.
+void add_rows(
+    const std::vector<ContactRow>& rows, double share, const std::vector<double>& violation,
+    const std::vector<char>& pushes, Coordinates& gradient, BlockSystem* system);
 
 }  // namespace diffsim

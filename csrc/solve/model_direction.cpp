@@ -39,13 +39,16 @@ void ModelDirection::recall_forces() {
     if (m_list == m_path.list_number()) return;
     m_list = m_path.list_number();
     m_forces.assign(m_zone.contacts.size(), 0.0);
+    m_friction.assign(m_zone.friction != nullptr ? m_zone.contacts.size() : 0, {});
     if (m_kept.empty()) return;
     for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
         const Contact& contact = m_zone.contacts[k].contact;
         const auto found = std::lower_bound(
             m_kept.begin(), m_kept.end(), contact,
-            [](const auto& kept, const Contact& c) { return before(kept.first, c); });
-        if (found != m_kept.end() && !before(contact, found->first)) m_forces[k] = found->second;
+            [](const Kept& kept, const Contact& c) { return before(kept.contact, c); });
+        if (found == m_kept.end() || before(contact, found->contact)) continue;
+        m_forces[k] = found->force;
+        if (!m_friction.empty()) m_friction[k] = found->friction;
     }
 }
 
@@ -55,21 +58,32 @@ void ModelDirection::start_from(const ZonePoint& point) {
         const ZoneContact& contact = m_zone.contacts[active.index];
         const double push = normal_force(contact.law, active.geometry.distance).force;
         const double force = edge_mollifier(active.geometry.sine_sq).value * push;
-        if (force > 0.0) m_kept.emplace_back(contact.contact, force);
+        if (force > 0.0) m_kept.push_back({contact.contact, force, {}});
     }
-    std::sort(m_kept.begin(), m_kept.end(), [](const auto& a, const auto& b) { return before(a.first, b.first); });
+    sort_kept();
     m_list = -1;
 }
 
 void ModelDirection::keep_forces() {
     m_kept.clear();
     std::fill(m_forces.begin(), m_forces.end(), 0.0);
+    std::fill(m_friction.begin(), m_friction.end(), FrictionState());
+    for (const FrictionRow& slip : m_model.friction) {
+        const ContactRow& row = m_model.rows[slip.normal];
+        if (row.force > 0.0) m_friction[row.contact] = slip.state();
+    }
     for (const ContactRow& row : m_model.rows) {
         if (!(row.force > 0.0)) continue;
         m_forces[row.contact] = row.force;
-        m_kept.emplace_back(m_zone.contacts[row.contact].contact, row.force);
+        m_kept.push_back(
+            {m_zone.contacts[row.contact].contact, row.force,
+             m_friction.empty() ? FrictionState() : m_friction[row.contact]});
     }
-    std::sort(m_kept.begin(), m_kept.end(), [](const auto& a, const auto& b) { return before(a.first, b.first); });
+    sort_kept();
+}
+
+void ModelDirection::sort_kept() {
+    std::sort(m_kept.begin(), m_kept.end(), [](const Kept& a, const Kept& b) { return before(a.contact, b.contact); });
 }
 
 // --- the model --------------------------------------------------------------------------------------------------------
@@ -103,10 +117,17 @@ void ModelDirection::add_near(int index) {
 void ModelDirection::add_near(int index, const ContactGeometry& geometry) {
     if (geometry.sine_sq == 0.0) return;  // parallel edges push nothing
     const ZoneContact& contact = m_zone.contacts[index];
-    double stiffness = contact.law.stiffness.value;
+    double stiffness = contact.law.stiffness.value, wanted = contact.law.range.rest;
     const double compression = contact.law.range.rest - geometry.distance;
-    if (compression > 0.0) stiffness = normal_force(contact.law, geometry.distance).force / compression;
-    m_near.push_back({index, geometry, edge_mollifier(geometry.sine_sq).value * stiffness});
+    if (compression > 0.0) {
+        const PotentialValue push = normal_force(contact.law, geometry.distance);
+        stiffness = push.force / compression;
+        if (m_goal.is_near) {
+            stiffness = push.stiffness;
+            wanted = geometry.distance + push.force / push.stiffness;
+        }
+    }
+    m_near.push_back({index, geometry, edge_mollifier(geometry.sine_sq).value * stiffness, wanted});
 }
 
 void ModelDirection::sort_near() {
@@ -146,6 +167,7 @@ void ModelDirection::make_model() {
     // The model has the energy's gradient: that of the rows which push now is in `gradient` already.
     m_model.gradient = *m_gradient;
     m_model.rows.clear();
+    m_model.friction.clear();
     m_at.y = m_point.y;
     m_at.poses = m_point.poses;
     m_at.nodes = m_point.nodes;
@@ -170,19 +192,26 @@ void ModelDirection::make_model() {
 
 void ModelDirection::make_start_row(const NearContact& near) {
     const ZoneContact& contact = m_zone.contacts[near.contact];
-    ContactRow row = make_row(m_zone, contact, near.geometry, m_at, m_point.y, contact.law.range.rest);
+    ContactRow row = make_row(m_zone, contact, near.geometry, m_at, m_point.y, near.wanted);
     row.contact = near.contact;
     row.range = contact.law.range.rest - contact.law.range.floor;
     row.stiffness = near.stiffness;
     row.force = m_forces[near.contact];
-    const double compression = contact.law.range.rest - near.geometry.distance;
+    const double compression = near.wanted - near.geometry.distance;
     if (compression > 0.0) diffsim::add_row(row, row.stiffness * compression, m_model.gradient);
     m_model.rows.push_back(std::move(row));
+    add_friction_row(near, near.geometry);
 }
 
 /// Cold, Newton's method crawls from one set of pushing rows to the next: from soft rows to stiff ones it gets there in a
 /// few steps each.
 bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
+    if (!m_model.friction.empty()) {
+        const ModelSolution balanced = balance(m_model, m_zone, m_goal.tolerance, m_goal.scale, m_system, m_balance, p);
+        newton_steps += balanced.newton_steps;
+        m_right_guess = balanced.newton_steps == 1;
+        return balanced.status != ModelSolution::Status::indefinite;
+    }
     const Coordinates start = p;
     ModelSolution solution = minimise(m_model, 1.0, kCrawling, m_system, m_work, p);
     newton_steps += solution.newton_steps;
@@ -263,7 +292,10 @@ void ModelDirection::linearise_at(const Coordinates& y_end, const std::vector<Im
     }
     m_row_force.assign(m_zone.contacts.size(), 0.0);
     for (const ContactRow& row : m_model.rows) m_row_force[row.contact] = row.force;
+    for (const FrictionRow& slip : m_model.friction)
+        m_friction[static_cast<std::size_t>(m_model.rows[slip.normal].contact)] = slip.state();
     m_model.rows.clear();
+    m_model.friction.clear();
     m_at.y = y_end;
     place(m_zone, y_end, m_at.poses, m_at.nodes);
     auto impact = impacts.begin();
@@ -288,12 +320,13 @@ void ModelDirection::linearise_at(const Coordinates& y_end, const std::vector<Im
 
 void ModelDirection::add_row(const NearContact& near, const ContactGeometry& geometry) {
     const ZoneContact& contact = m_zone.contacts[near.contact];
-    ContactRow row = make_row(m_zone, contact, geometry, m_at, m_point.y, contact.law.range.rest);
+    ContactRow row = make_row(m_zone, contact, geometry, m_at, m_point.y, near.wanted);
     row.contact = near.contact;
     row.range = contact.law.range.rest - contact.law.range.floor;
     row.stiffness = near.stiffness;
     row.force = m_row_force[near.contact];
     m_model.rows.push_back(std::move(row));
+    add_friction_row(near, geometry);
 }
 
 void ModelDirection::add_row_at_impact(const NearContact& near, double toi, const Coordinates& y_end) {
@@ -309,6 +342,8 @@ void ModelDirection::add_row_at_impact(const NearContact& near, double toi, cons
     add_row(near, contact_geometry(m_zone, contact, m_at.poses, m_at.nodes));
     m_first_touches.push_back(std::move(m_model.rows.back()));
     m_model.rows.pop_back();
+    // Its friction comes in where the bodies are near each other at the beginning of a model.
+    if (!m_model.friction.empty() && m_model.friction.back().normal == m_model.rows.size()) m_model.friction.pop_back();
     for (std::size_t k = 0; k < 2; ++k) {
         m_at.y.bodies[bodies[k]] = y_end.bodies[bodies[k]];
         m_at.poses[bodies[k]] = poses[k];
@@ -359,8 +394,9 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
     m_aim = nullptr;
     m_first_touches.clear();
     recall_forces();
+    advance_multipliers();
     list_near();
-    if (m_near.empty() && driven) return way;
+    if (m_near.empty() && driven && m_zone.friction == nullptr) return way;
     make_model();
     bool cut_more = false;
     for (int listings = 0;;) {
@@ -398,6 +434,7 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
     way.found = true;
     if (!cut_more) m_cut.less();
     keep_forces();
+    m_way = p;
 
     std::vector<Impact> impacts;
     way.free = allowed_step(m_zone, m_point, y_end, &impacts);
@@ -430,6 +467,7 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
             if (free > way.free) {
                 way.free = free;
                 best = y_end;
+                m_way = p;
                 if (halvings == 0) keep_forces();
             }
             if (free == 1.0) break;

@@ -1,7 +1,7 @@
 #pragma once
 
-#include "solve/contact_model.hpp"
 #include "solve/cut_search.hpp"
+#include "solve/friction_model.hpp"
 #include "solve/zone_path.hpp"
 
 /// The direction of a zone far from its solution.
@@ -27,6 +27,22 @@ public:
         /// Driven bodies leave no room even where the rows are those of where the way ends: something is squeezed there.
         bool squeezes = false;
     };
+    /// What a solution with friction is asked for.
+    struct BalanceGoal {
+        double tolerance = 0.0;  ///< of the model's balance, in units of |L⁻¹ g|
+        SlipScale scale;
+        /// Compressed contacts have their stiffness, not the secant's: the model is then Newton's, but for what turns.
+        bool is_near = false;
+    };
+    void aim_for(const BalanceGoal& goal) { m_goal = goal; }
+
+    /// Add what friction does at the point, its contacts' shares of their bounds being those of the last model.
+    void add_friction_forces(Coordinates& gradient) const;
+    /// What friction takes up on this part of the last way, its bounds those of the last model.
+    double friction_work(double step) const;
+    /// The states of the last model, one per contact of the zone.
+    const std::vector<FrictionState>& friction() const { return m_friction; }
+
     /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts is
     /// made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then, none is found:
     /// a Newton step does as well.
@@ -46,16 +62,26 @@ private:
         int contact;
         ContactGeometry geometry;
         double stiffness;  ///< of the row
+        double wanted;     ///< from which distance on it pushes [m]
+    };
+    /// What the last model found of a contact.
+    struct Kept {
+        Contact contact;
+        double force;
+        FrictionState friction;
     };
 
     void recall_forces();
     void keep_forces();
+    void sort_kept();
     void list_near();
     void add_near(int index);
     void add_near(int index, const ContactGeometry& geometry);
     void sort_near();
     void make_model();
     void make_start_row(const NearContact& near);
+    void add_friction_row(const NearContact& near, const ContactGeometry& geometry);
+    void advance_multipliers();
     bool solve(Coordinates& p, int& newton_steps);
     bool turns_too_far(const Coordinates& p);
     bool add_missed(const Coordinates& y_end);
@@ -84,11 +110,15 @@ private:
     std::vector<NearContact> m_near;          // those with a row, in the order of the rows
     std::vector<ContactRow> m_first_touches;  // rows of fast bodies at their times of impact
     std::vector<PushingContact> m_pushing;
-    std::vector<double> m_forces;                    // of the last model, per contact of the zone
-    std::vector<std::pair<Contact, double>> m_kept;  // the same, by contact, across lists
-    int m_list = -1;                                 // the list that m_forces is of
-    std::vector<double> m_weight;                    // proximal, per body and node
-    CutSearch m_cut;                                 // of the elastic curvature
+    std::vector<double> m_forces;           // of the last model, per contact of the zone
+    std::vector<FrictionState> m_friction;  // the same; empty where there is none
+    std::vector<Kept> m_kept;               // the same, by contact, across lists
+    BalanceGoal m_goal;
+    BalanceWorkspace m_balance;
+    Coordinates m_way;             // the last way, from the point
+    int m_list = -1;               // the list that m_forces is of
+    std::vector<double> m_weight;  // proximal, per body and node
+    CutSearch m_cut;               // of the elastic curvature
 };
 
 }  // namespace diffsim

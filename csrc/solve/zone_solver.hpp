@@ -3,6 +3,7 @@
 #include <optional>
 #include <vector>
 
+#include "zone/friction_row.hpp"
 #include "zone/zone_contacts.hpp"
 #include "zone/zone_derivatives.hpp"
 
@@ -45,7 +46,8 @@ struct ZoneWorkspace {
     BlockSystem system;
     ContactCoverage coverage;
     Coordinates step, y_end;
-    std::vector<double> pushed;  ///< sum of the contact forces on each body
+    std::vector<double> pushed;             ///< sum of the contact forces on each body
+    std::vector<ContactFriction> friction;  ///< one per active contact of the point; empty where a zone has none
 };
 
 /// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts after

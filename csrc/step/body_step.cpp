@@ -119,12 +119,14 @@ Vec6 body_upstream(const BodyStateGradient& end, const Vec6& y, double dt) {
 namespace {
 
 void kinematic_backward(
-    const Vec6& y, double dt, const Vec6& pose, BodyStateGradient& gradient, BodyControl& control_gradient) {
+    const Vec6& y, double dt, const Vec6& pose, const Vec6& drive, BodyStateGradient& gradient,
+    BodyControl& control_gradient) {
     const Vec3 theta = y.head<3>();
     const Vec3 covector = gradient.orientation + pose.head<3>();
     const Vec3 shift = gradient.position + pose.tail<3>();
-    control_gradient.angular_velocity += gradient.angular_velocity + dt * left_jacobian(theta).transpose() * covector;
-    control_gradient.velocity += gradient.velocity + dt * shift;
+    control_gradient.angular_velocity +=
+        gradient.angular_velocity + dt * (left_jacobian(theta).transpose() * covector + drive.head<3>());
+    control_gradient.velocity += gradient.velocity + dt * (shift + drive.tail<3>());
     gradient.orientation = exp_rotation(theta).transpose() * covector;
     gradient.position = shift;
     gradient.velocity.setZero();
@@ -184,7 +186,7 @@ void body_backward(
                 parameter_gradient);
             break;
         case BodyKind::kinematic:
-            kinematic_backward(y, setting.dt, adjoint.pose, gradient, control_gradient);
+            kinematic_backward(y, setting.dt, adjoint.pose, adjoint.drive, gradient, control_gradient);
             break;
         case BodyKind::static_:
             gradient.orientation += adjoint.pose.head<3>();

@@ -52,6 +52,7 @@ struct BodyAdjoint {
     bool in_zone;            ///< it touched something; otherwise it has no multiplier
     const Vec6& multiplier;  ///< z
     const Vec6& pose;        ///< along its twist at the end of the step
+    const Vec6& drive;       ///< of a driven one, through slips: along its motion, its pose at the end held
 };
 
 /// Carry the gradient at the end of a step back to its start: `gradient` is overwritten, the others are added to. `state`,

@@ -98,7 +98,8 @@ void ClothBackward::finish(const Zone& zone, const ZoneAdjoint& adjoint) {
             if (zone.nodes[node].pinned) {
                 // Their motion is given, but contacts with their features are as stiff as their mass makes them.
                 m_parameter_gradient.cloths[cloth.id].density += adjoint.node_mass_gradient[node] * model.node_area[k];
-                pinned_node(model.first_node + k, pose, adjoint.start_gradient[node]);
+                pinned_node(
+                    model.first_node + k, pose, adjoint.start_gradient[node], adjoint.drive_gradient.nodes[node]);
                 continue;
             }
             const Vec3 error = m_y.nodes[model.first_node + k] - zone.nodes[node].target;
@@ -141,13 +142,13 @@ void ClothBackward::finish_split(
         ZonePoint point;
         Coordinates upstream;
         start_elastic_pass(contact_zone, contact, cloth, elastic_shift, zone, point, upstream);
-        ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, mode, needs, workspace);
+        ZoneAdjoint adjoint = zone_adjoint(zone, point, {}, upstream, mode, needs, workspace);
         for (int k = 0; k < model.node_count(); ++k) {
             const int id = model.first_node + k;
             Vec3& pose = adjoint.pose_gradient.nodes[k];
             pose += contact.pose_gradient.nodes[cloth.first_node + k];
             if (zone.nodes[k].pinned) {
-                pinned_node(id, pose, adjoint.start_gradient[k]);
+                pinned_node(id, pose, adjoint.start_gradient[k], contact.drive_gradient.nodes[cloth.first_node + k]);
                 continue;
             }
             const Vec3 error = elastic_shift[id] - zone.nodes[k].target;
@@ -182,10 +183,10 @@ void ClothBackward::free_node(
 }
 
 /// A pinned node, whose motion is dt times its given velocity; `start` is the gradient with respect to where it starts
-/// while it ends where it did.
-void ClothBackward::pinned_node(int node, const Vec3& pose, const Vec3& start) {
+/// while it ends where it did, `drive` to how it gets there, through slips.
+void ClothBackward::pinned_node(int node, const Vec3& pose, const Vec3& start, const Vec3& drive) {
     const Vec3 position = m_gradient.node_position[node] + pose;
-    m_control_gradient.node_velocity[node] += m_gradient.node_velocity[node] + m_setting.dt * position;
+    m_control_gradient.node_velocity[node] += m_gradient.node_velocity[node] + m_setting.dt * (position + drive);
     m_gradient.node_position[node] = position + start;
     m_gradient.node_velocity[node].setZero();
 }

@@ -59,7 +59,7 @@ private:
         const std::vector<Vec3>& elastic_shift, Zone& zone, ZonePoint& point, Coordinates& upstream);
     void add_material(int cloth, const ClothParameters& gradient);
     void free_node(int cloth, int k, const Vec3& z, const Vec3& error, double mass_gradient, const Vec3& pose);
-    void pinned_node(int node, const Vec3& pose, const Vec3& start);
+    void pinned_node(int node, const Vec3& pose, const Vec3& start, const Vec3& drive);
 
     StepSetting m_setting;
     const SceneState& m_start;

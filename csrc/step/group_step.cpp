@@ -11,11 +11,16 @@ namespace {
 
 std::uint64_t pack(int high, std::uint32_t low) { return (static_cast<std::uint64_t>(high) << 32) ^ low; }
 
-void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outcome, GroupResults& results) {
+/// `friction`: of the zone, empty where it has none; null in scenes without.
+void keep_contacts(
+    const Zone& zone, const ZonePoint& point, const std::vector<ContactFriction>* friction, GroupOutcome& outcome,
+    GroupResults& results) {
     outcome.first_contact = static_cast<int>(results.contacts.size());
-    for (const ActiveContact& active : point.active) {
+    for (std::size_t k = 0; k < point.active.size(); ++k) {
+        const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
         const Contact& c = contact.contact;
+        if (friction != nullptr) results.friction.push_back(friction->empty() ? ContactFriction() : (*friction)[k]);
         const ContactLaw& law = contact.law;
         results.contacts.push_back(c);
         results.exact.push_back({law.shift, zone.contacts.memory.compliance});
@@ -25,6 +30,7 @@ void keep_contacts(const Zone& zone, const ZonePoint& point, GroupOutcome& outco
         hash = mix(hash, pack(c.object_a, static_cast<std::uint32_t>(c.object_b)));
         hash = mix(hash, pack(c.feature_a, static_cast<std::uint32_t>(c.feature_b)));
         hash = mix(hash, pack(static_cast<int>(c.type), active.geometry.closest.feature_code));
+        if (friction != nullptr) hash = mix(hash, results.friction.back().slips ? 1 : 0);
     }
     outcome.contact_end = static_cast<int>(results.contacts.size());
 }
@@ -61,7 +67,9 @@ GroupOutcome GroupStep::solve(
     if (outcome.result.status == ZoneStatus::bad_start)
         refuse_start(zone.contacts[outcome.result.worst_contact], point.distances[outcome.result.worst_contact]);
     write_motion(group, members, memory.zone, objects);
-    keep_contacts(zone, point, outcome, memory.results);
+    keep_contacts(
+        zone, point, m_parameters.friction.empty() ? nullptr : &memory.zone.workspace.friction, outcome,
+        memory.results);
     if (outcome.result.status != ZoneStatus::converged) keep_failure(group.root, zone, point, memory.results);
     return outcome;
 }
@@ -96,11 +104,18 @@ void GroupStep::join(
         zone.bodies.back().start.t -= zone.origin;
     }
     zone.dynamic_count = zone.body_count();
+    if (has_friction(group, members)) zone.friction = &m_parameters.friction;
     if (!m_options.split) return;
     zone.elastic = false;
     for (const ZoneCloth& cloth : zone.cloths)
         for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
             zone.nodes[cloth.first_node + k].target = objects.elastic_shift[m_model.cloths[cloth.id].first_node + k];
+}
+
+bool GroupStep::has_friction(const ObjectGroup& group, const std::vector<int>& members) const {
+    if (m_parameters.friction.empty()) return false;
+    const auto rubs = [&](int object) { return m_parameters.friction[static_cast<std::size_t>(object)] > 0.0; };
+    return std::any_of(members.begin() + group.first, members.begin() + group.end, rubs);
 }
 
 void GroupStep::write_motion(

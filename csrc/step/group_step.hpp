@@ -54,6 +54,7 @@ private:
     ZoneOptions zone_options() const;
     Zone& new_zone(ZoneMemory& memory, const Vec3& origin) const;
     void join(const ObjectGroup& group, const std::vector<int>& members, const Objects& objects, Zone& zone) const;
+    bool has_friction(const ObjectGroup& group, const std::vector<int>& members) const;
     void write_motion(
         const ObjectGroup& group, const std::vector<int>& members, const ZoneMemory& memory,
         const Objects& objects) const;

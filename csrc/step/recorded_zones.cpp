@@ -57,6 +57,11 @@ void RecordedZones::rebuild(int index, ZoneMemory& memory, std::vector<int>& loc
         rescue_contacts(zone);
         evaluate(zone, point);
     }
+    std::vector<ContactFriction>& friction = memory.workspace.friction;
+    friction.clear();
+    if (zone.friction == nullptr) return;
+    for (const ActiveContact& active : point.active)
+        friction.push_back(m_record.zones.friction[static_cast<std::size_t>(first.contact + active.index)]);
 }
 
 /// The bodies and cloths that yield.
@@ -69,6 +74,7 @@ void RecordedZones::add_objects(
             : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
     make_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
     zone.elastic = !m_options.split;
+    if (!m_parameters.friction.empty()) zone.friction = &m_parameters.friction;
     memory.workspace.point.y.resize(0, 0);
     for (int b = first.body; b < end.body; ++b) join_body(memory, local, m_record.zones.bodies[b]);
     zone.dynamic_count = end.body - first.body;
@@ -79,11 +85,13 @@ void RecordedZones::join_body(ZoneMemory& memory, std::vector<int>& local, int i
     const BodyState& state = m_record.start.bodies[id];
     ZoneBody body;
     body.id = id;
-    if (m_model.bodies[id].is_dynamic())
+    if (m_model.bodies[id].is_dynamic()) {
         body = moving_body(
             {m_model, m_parameters, m_options.dt}, id, state, m_control.bodies[id], m_record.free_rotation[id]);
-    else
+    } else {
         body.start = {quaternion_to_matrix(state.orientation), state.position};
+        body.target = m_record.y.bodies[id];
+    }
     body.start.t -= memory.zone.origin;
     local[id] = static_cast<int>(memory.zone.bodies.size());
     memory.zone.bodies.push_back(body);

@@ -343,10 +343,12 @@ private:
             const GroupResults& results = m_workspace.memory(outcome.thread).results;
             const int first = outcome.first_contact;
             m_scratch.contact_lists.push_back(
-                {results.contacts.data() + first, results.exact.data() + first, outcome.contact_end - first});
+                {results.contacts.data() + first, results.exact.data() + first,
+                 results.friction.empty() ? nullptr : results.friction.data() + first, outcome.contact_end - first});
         }
         m_scratch.zone_finder.find(
-            m_model, m_scratch.movers, m_scratch.contact_lists, m_options.compliance == 0.0, m_options.global_zone,
+            m_model, m_scratch.movers, m_scratch.contact_lists,
+            {m_options.compliance == 0.0, !m_setting.parameters.friction.empty(), m_options.global_zone},
             m_scratch.zones);
         m_info.contacts = static_cast<int>(m_scratch.zones.contacts.size());
         int body = 0, cloth = 0, contact = 0;

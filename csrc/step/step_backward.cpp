@@ -16,10 +16,12 @@ constexpr int kPortionsPerThread = 32;  // of the zones: they take differently l
 }  // namespace
 
 struct StepWorkspace::BackwardScratch {
-    std::vector<Vec6> pose_gradient;  ///< along the twist of the body at the end of the step
+    std::vector<Vec6> pose_gradient;   ///< along the twist of the body at the end of the step
+    std::vector<Vec6> drive_gradient;  ///< along the motion of a driven body
     std::vector<Vec6> multiplier;
     std::vector<char> in_zone;
     std::vector<SharedGradient> shared;
+    std::vector<FrictionGradient> friction;
 };
 
 namespace {
@@ -48,6 +50,7 @@ public:
         if (m_record.held) return;
         const std::size_t count = m_model.bodies.size();
         m_scratch.pose_gradient.assign(count, Vec6::Zero());
+        m_scratch.drive_gradient.assign(count, Vec6::Zero());
         m_scratch.multiplier.assign(count, Vec6::Zero());
         m_scratch.in_zone.assign(count, 0);
         for (int i : m_record.zones.bodies) m_scratch.in_zone[i] = 1;
@@ -77,13 +80,34 @@ private:
             m_scratch.shared.begin(), m_scratch.shared.end(), [](const SharedGradient& a, const SharedGradient& b) {
                 return std::pair(a.zone, a.body) < std::pair(b.zone, b.body);
             });
-        for (const SharedGradient& part : m_scratch.shared) m_scratch.pose_gradient[part.body] += part.pose;
+        for (const SharedGradient& part : m_scratch.shared) {
+            m_scratch.pose_gradient[part.body] += part.pose;
+            m_scratch.drive_gradient[part.body] += part.drive;
+        }
+        add_friction();
+    }
+
+    /// Objects are in several zones, the ground in all.
+    void add_friction() {
+        std::vector<FrictionGradient>& parts = m_scratch.friction;
+        parts.clear();
+        m_workspace.for_each_memory([&](ThreadMemory& memory) {
+            parts.insert(parts.end(), memory.backward.friction.begin(), memory.backward.friction.end());
+            memory.backward.friction.clear();
+        });
+        std::stable_sort(parts.begin(), parts.end(), [](const FrictionGradient& a, const FrictionGradient& b) {
+            return a.zone < b.zone;
+        });
+        for (const FrictionGradient& part : parts)
+            m_parameter_gradient.friction[static_cast<std::size_t>(part.object)] += part.value;
     }
 
     void finish_body(int i) {
         body_backward(
             m_setting, i, m_record.start.bodies[i], m_control.bodies[i], m_record.free_rotation[i],
-            m_record.y.bodies[i], {m_scratch.in_zone[i] != 0, m_scratch.multiplier[i], m_scratch.pose_gradient[i]},
+            m_record.y.bodies[i],
+            {m_scratch.in_zone[i] != 0, m_scratch.multiplier[i], m_scratch.pose_gradient[i],
+             m_scratch.drive_gradient[i]},
             m_needs, m_gradient.bodies[i], m_control_gradient.bodies[i], m_parameter_gradient);
     }
 
@@ -114,12 +138,15 @@ private:
             for (int k = 0; k < m_model.cloths[cloth.id].node_count(); ++k)
                 scratch.upstream.nodes.push_back(
                     node_upstream(m_gradient, m_model.cloths[cloth.id].first_node + k, m_options.dt));
-        const ZoneAdjoint& adjoint =
-            zone_adjoint(zone, point, scratch.upstream, m_options.adjoint, m_needs, scratch.adjoint);
+        const ZoneAdjoint& adjoint = zone_adjoint(
+            zone, point, memory.workspace.friction, scratch.upstream, m_options.adjoint, m_needs, scratch.adjoint);
+        for (const ZoneAdjoint::FrictionPart& part : adjoint.friction_gradient)
+            scratch.friction.push_back({index, part.object, part.value});
         for (int k = 0; k < zone.body_count(); ++k) {
             const int id = zone.bodies[k].id;
             if (k >= zone.dynamic_count) {
-                scratch.shared.push_back({index, id, adjoint.pose_gradient.bodies[k]});
+                scratch.shared.push_back(
+                    {index, id, adjoint.pose_gradient.bodies[k], adjoint.drive_gradient.bodies[k]});
                 continue;
             }
             m_scratch.pose_gradient[id] = adjoint.pose_gradient.bodies[k];

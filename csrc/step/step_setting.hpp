@@ -19,6 +19,7 @@ struct ParameterGradient {
     std::vector<Mat3> inertia;
     Vec3 gravity = Vec3::Zero();
     std::vector<ClothParameters> cloths;
+    std::vector<double> friction;  ///< one per object; empty where there is none
 };
 
 /// Numbers whose squares are larger count as overflown, be it on the way or in a state: what is computed from smaller ones

@@ -23,14 +23,16 @@ struct FailedGroup {
 
 /// What one thread collects of the groups it solves.
 struct GroupResults {
-    std::vector<Contact> contacts;    ///< active, group after group
-    std::vector<ExactContact> exact;  ///< of theirs, if they are
+    std::vector<Contact> contacts;          ///< active, group after group
+    std::vector<ExactContact> exact;        ///< of theirs, if they are
+    std::vector<ContactFriction> friction;  ///< of theirs, if the scene has some
     std::vector<BlockedDrive> blocked;
     std::vector<FailedGroup> failed;  ///< also of groups that were joined by others and solved again
 
     void clear() {
         contacts.clear();
         exact.clear();
+        friction.clear();
         blocked.clear();
         failed.clear();
     }
@@ -39,7 +41,13 @@ struct GroupResults {
 /// What a zone gives a body that it shares with others.
 struct SharedGradient {
     int zone, body;
-    Vec6 pose;
+    Vec6 pose, drive;
+};
+
+/// What a zone gives a coefficient of friction.
+struct FrictionGradient {
+    int zone, object;
+    double value;
 };
 
 /// What one thread needs for the backward of zones, beside the zone.
@@ -48,6 +56,7 @@ struct ZoneBackwardScratch {
     Coordinates upstream;
     AdjointWorkspace adjoint, elastic;  ///< of the zone; of split coupling's elastic pass
     std::vector<SharedGradient> shared;
+    std::vector<FrictionGradient> friction;
 };
 
 /// What one thread of a step keeps to itself; see StepWorkspace::memory.

@@ -16,33 +16,34 @@ int to_offsets(std::vector<int>& sizes) {
 
 std::size_t TouchingZones::bytes() const {
     return contacts.capacity() * sizeof(Contact) + exact.capacity() * sizeof(ExactContact) +
+           friction.capacity() * sizeof(ContactFriction) +
            (bodies.capacity() + cloths.capacity() + body_end.capacity() + cloth_end.capacity() +
             contact_end.capacity()) *
                sizeof(int);
 }
 
 void ZoneFinder::find(
-    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_exact,
-    bool one_zone, TouchingZones& zones) {
+    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, const Wanted& wanted,
+    TouchingZones& zones) {
     const int object_count = model.body_count() + model.cloth_count();
     const auto yields = [&](int object) {
         return object >= 0 && (model.is_cloth(object) || model.bodies[object].is_dynamic());
     };
     const auto for_each_contact = [&](const auto& visit) {
         for (const ContactList& list : lists)
-            for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list.exact[k]);
+            for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list, k);
     };
 
     m_touching.reset(object_count);
     m_zone_of.assign(static_cast<std::size_t>(object_count), -1);
     for (int c = model.body_count(); c < object_count; ++c) m_zone_of[c] = 0;
-    if (one_zone) {
+    if (wanted.one_zone) {
         for (int i : movers) {
             m_zone_of[i] = 0;
             m_touching.unite(movers[0], i);
         }
     }
-    for_each_contact([&](const Contact& c, const ExactContact&) {
+    for_each_contact([&](const Contact& c, const ContactList&, int) {
         if (yields(c.object_a)) m_zone_of[c.object_a] = 0;
         if (yields(c.object_b)) m_zone_of[c.object_b] = 0;
         if (yields(c.object_a) && yields(c.object_b)) m_touching.unite(c.object_a, c.object_b);
@@ -67,11 +68,11 @@ void ZoneFinder::find(
     const auto zone_of_contact = [&](const Contact& c) {
         return m_zone_of[yields(c.object_a) ? c.object_a : c.object_b];
     };
-    for_each_contact([&](const Contact& c, const ExactContact&) { ++zones.contact_end[zone_of_contact(c)]; });
+    for_each_contact([&](const Contact& c, const ContactList&, int) { ++zones.contact_end[zone_of_contact(c)]; });
     zones.bodies.resize(static_cast<std::size_t>(to_offsets(zones.body_end)));
     zones.cloths.resize(static_cast<std::size_t>(to_offsets(zones.cloth_end)));
     zones.contacts.resize(static_cast<std::size_t>(to_offsets(zones.contact_end)));
-    zones.exact.resize(with_exact ? zones.contacts.size() : 0);
+    zones.exact.resize(wanted.exact ? zones.contacts.size() : 0);
     for (int i : movers) {
         if (m_zone_of[i] < 0) continue;
         if (model.is_cloth(i))
@@ -79,10 +80,12 @@ void ZoneFinder::find(
         else
             zones.bodies[zones.body_end[m_zone_of[i]]++] = i;
     }
-    for_each_contact([&](const Contact& c, const ExactContact& exact) {
+    zones.friction.resize(wanted.friction ? zones.contacts.size() : 0);
+    for_each_contact([&](const Contact& c, const ContactList& list, int k) {
         const int slot = zones.contact_end[zone_of_contact(c)]++;
         zones.contacts[slot] = c;
-        if (with_exact) zones.exact[slot] = exact;
+        if (wanted.exact) zones.exact[slot] = list.exact[k];
+        if (wanted.friction) zones.friction[slot] = list.friction[k];
     });
 }
 

@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "contact/contact.hpp"
+#include "contact/friction.hpp"
 #include "math/union_find.hpp"
 #include "model/model.hpp"
 
@@ -15,6 +15,7 @@ struct TouchingZones {
     std::vector<int> bodies, cloths;
     std::vector<Contact> contacts;
     std::vector<ExactContact> exact;                    ///< one per contact; empty when contacts give way
+    std::vector<ContactFriction> friction;              ///< one per contact; empty in scenes without
     std::vector<int> body_end, cloth_end, contact_end;  ///< of each zone in the lists above
 
     int count() const { return static_cast<int>(body_end.size()); }
@@ -25,16 +26,23 @@ struct TouchingZones {
 struct ContactList {
     const Contact* contacts;
     const ExactContact* exact;
+    const ContactFriction* friction;
     int count;
 };
 
 /// Makes zones from contacts; keeps its memory.
 class ZoneFinder {
 public:
-    /// `movers` are the dynamic bodies and the cloths, sorted. `one_zone` puts them all into one.
+    /// What zones are to be made of beside bodies, cloths and contacts.
+    struct Wanted {
+        bool exact = false;     ///< TouchingZones::exact
+        bool friction = false;  ///< TouchingZones::friction
+        bool one_zone = false;  ///< all that yields in one
+    };
+    /// `movers` are the dynamic bodies and the cloths, sorted.
     void find(
-        const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool with_exact,
-        bool one_zone, TouchingZones& zones);
+        const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, const Wanted& wanted,
+        TouchingZones& zones);
 
 private:
     UnionFind m_touching;

@@ -56,9 +56,6 @@ ContactRow make_row(
     return row;
 }
 
-namespace {
-
-/// What a row of these bodies is multiplied with.
 Vector<9> relative_motion(const ContactRow& row, const Coordinates& p) {
     Vector<9> motion = Vector<9>::Zero();
     if (row.a >= 0) {
@@ -71,6 +68,8 @@ Vector<9> relative_motion(const ContactRow& row, const Coordinates& p) {
     }
     return motion;
 }
+
+namespace {
 
 double row_times(const ContactRow& row, const Vector<9>& motion, const Coordinates& p) {
     double sum = row.relative.dot(motion);

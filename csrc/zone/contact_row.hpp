@@ -37,6 +37,9 @@ ContactRow make_row(
     const Zone& zone, const ZoneContact& contact, const ContactGeometry& geometry, const Placement& at,
     const Coordinates& y_now, double wanted);
 
+/// What the bodies of a row move by, along what its `relative` is taken.
+Vector<9> relative_motion(const ContactRow& row, const Coordinates& p);
+
 /// rowᵀ p
 double row_times(const ContactRow& row, const Coordinates& p);
 

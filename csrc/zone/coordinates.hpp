@@ -23,4 +23,23 @@ struct Coordinates {
     }
 };
 
+inline double dot(const Coordinates& a, const Coordinates& b) {
+    double sum = 0.0;
+    for (std::size_t i = 0; i < a.bodies.size(); ++i) sum += a.bodies[i].dot(b.bodies[i]);
+    for (std::size_t i = 0; i < a.nodes.size(); ++i) sum += a.nodes[i].dot(b.nodes[i]);
+    return sum;
+}
+
+/// sum += factor * a
+inline void add(double factor, const Coordinates& a, Coordinates& sum) {
+    for (std::size_t i = 0; i < a.bodies.size(); ++i) sum.bodies[i] += factor * a.bodies[i];
+    for (std::size_t i = 0; i < a.nodes.size(); ++i) sum.nodes[i] += factor * a.nodes[i];
+}
+
+/// a *= factor
+inline void scale(double factor, Coordinates& a) {
+    for (Vec6& value : a.bodies) value *= factor;
+    for (Vec3& value : a.nodes) value *= factor;
+}
+
 }  // namespace diffsim

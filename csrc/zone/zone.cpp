@@ -21,6 +21,7 @@ Zone& make_zone(
     zone.dynamic_count = 0;
     zone.model = &model;
     zone.cloth_parameters = &cloths;
+    zone.friction = nullptr;
     zone.exact_contact = compliance == 0.0;
     zone.compliance = zone.exact_contact ? kDefaultCompliance : compliance;
     forget_contacts(zone);

@@ -82,6 +82,7 @@ struct Zone {
     std::vector<ZoneNode> nodes;
     std::vector<ZoneCloth> cloths;
     const std::vector<ClothParameters>* cloth_parameters = nullptr;  ///< of all cloths of the model
+    const std::vector<double>* friction = nullptr;  ///< Parameters::friction; null where no pair can have any
     bool elastic = true;        ///< false: cloth is loose nodes, as in the contact pass of split coupling
     bool contacts_off = false;  ///< as in its elastic pass
     ContactSet contacts;

@@ -7,11 +7,17 @@ namespace diffsim {
 
 /// How far a point is from the minimum.
 struct Accuracy {
-    double residual;  ///< largest |L⁻¹ g| of a body or node, M = L Lᵀ, relative to the largest force
-    double floor;     ///< what rounding leaves of it
+    double residual;   ///< largest |L⁻¹ g| of a body or node, M = L Lᵀ, relative to the largest force
+    double floor;      ///< what rounding leaves of it
+    double reference;  ///< that largest force
 };
 
-/// From derivatives with a Hessian. `position`: size of the numbers that distances are differences of [m].
+/// Largest |L⁻¹ g| of a body or node.
+double largest_scaled(const Zone& zone, const Coordinates& g);
+/// Largest |Lᵀ p|.
+double largest_motion(const Zone& zone, const Coordinates& p);
+
+/// From derivatives with a Hessian, or with the contacts' stiffness at least. `position`: size of the numbers that distances are differences of [m].
 Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double position);
 
 /// What rounding can do to the energy. `system` holds the zone's last Hessian, `pushed` is scratch.

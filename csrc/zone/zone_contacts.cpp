@@ -78,6 +78,17 @@ void join_passive(
     }
 }
 
+/// Of two objects the geometric mean.
+void set_friction(const Zone& zone, const Contact& contact, ContactLaw& law) {
+    const Model& model = *zone.model;
+    const std::size_t a = static_cast<std::size_t>(contact.object_a);
+    const double mu_b =
+        contact.with_ground() ? zone.friction->back() : (*zone.friction)[static_cast<std::size_t>(contact.object_b)];
+    law.friction = std::sqrt((*zone.friction)[a] * mu_b);
+    const double margins = model.margin_sum(contact.object_a, contact.object_b);
+    if (margins > 0.0) law.margin_share = model.margin(contact.object_a) / margins;
+}
+
 }  // namespace
 
 double contact_margins(const Model& model, const Contact& contact) {
@@ -98,6 +109,7 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
         set.laws.back().stiffness = with_sides(zone, set[set.size() - 1], [&](const auto& side_a, const auto& side_b) {
             return contact_stiffness(side_a.mass(), side_b.mass(), zone.contacts.memory.compliance);
         });
+        if (zone.friction != nullptr) set_friction(zone, contact, set.laws.back());
     }
     list_feature_vertices(zone, set[set.size() - 1]);
 }

@@ -183,7 +183,7 @@ VectorX free_part(const Zone& zone, const VectorX& y) {
 
 VectorX multiplier(const Zone& zone, const ZonePoint& point, const Coordinates& upstream, AdjointMode mode) {
     AdjointWorkspace workspace;
-    return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).multiplier);
+    return flatten(zone_adjoint(zone, point, {}, upstream, mode, GradientNeeds{}, workspace).multiplier);
 }
 
 void check_same_system(const Zone& zone, const ZonePoint& point) {
@@ -247,7 +247,7 @@ TEST(stiff_contacts_cost_dense_and_qr_no_digits) {
         const Coordinates upstream = random_upstream(zone, 4);
         const auto pose_gradient = [&](AdjointMode mode) {
             AdjointWorkspace workspace;
-            return flatten(zone_adjoint(zone, point, upstream, mode, GradientNeeds{}, workspace).pose_gradient);
+            return flatten(zone_adjoint(zone, point, {}, upstream, mode, GradientNeeds{}, workspace).pose_gradient);
         };
         const VectorX by_lu = pose_gradient(AdjointMode::dense), by_qr = pose_gradient(AdjointMode::qr);
         CHECK(by_lu.norm() > 0.1);
@@ -291,7 +291,7 @@ TEST(all_modes_agree_on_hard_contacts_with_cloth_as_far_as_they_are_straight) {
     // J z = 0: no contact opens or closes along z.
     AdjointWorkspace workspace;
     const Coordinates z =
-        zone_adjoint(zone, point, upstream, AdjointMode::dense, GradientNeeds{}, workspace).multiplier;
+        zone_adjoint(zone, point, {}, upstream, AdjointMode::dense, GradientNeeds{}, workspace).multiplier;
     const auto distances_at = [&](double s) {
         ZonePoint moved;
         moved.y = point.y;
@@ -316,7 +316,8 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
         CHECK(point.active.size() >= 4);
         const Coordinates upstream = random_upstream(zone, 9);
         AdjointWorkspace workspace;
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
+        const ZoneAdjoint adjoint =
+            zone_adjoint(zone, point, {}, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
         // What the loss sees of pinned nodes is their own motion, which is not the adjoint's part.
         const VectorX weights = flatten(without_pinned(zone, upstream));
         const auto loss = [&](const Scene& changed) { return weights.dot(changed.solution()); };
@@ -385,7 +386,8 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
         const std::size_t count = scene.bodies.size();
         const Coordinates upstream = random_upstream(zone, 5);
         AdjointWorkspace workspace;
-        const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
+        const ZoneAdjoint adjoint =
+            zone_adjoint(zone, point, {}, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
         const auto loss = [&](const Scene& changed) { return flatten(upstream).dot(changed.solution()); };
 
         // d(loss)/d(target) = M z
@@ -440,8 +442,8 @@ TEST(what_is_not_asked_for_is_left_at_zero) {
         const Coordinates upstream = random_upstream(zone, 6);
         AdjointWorkspace workspace;
         const GradientNeeds nothing{false, false, false, false};
-        const ZoneAdjoint all = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
-        const ZoneAdjoint none = zone_adjoint(zone, point, upstream, AdjointMode::exact, nothing, workspace);
+        const ZoneAdjoint all = zone_adjoint(zone, point, {}, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
+        const ZoneAdjoint none = zone_adjoint(zone, point, {}, upstream, AdjointMode::exact, nothing, workspace);
         CHECK(flatten(none.multiplier) == flatten(all.multiplier));
         for (std::size_t i = 0; i < all.pose_gradient.nodes.size(); ++i) CHECK(none.pose_gradient.nodes[i].isZero(0.0));
         for (std::size_t i = 0; i < all.mass_gradient.size(); ++i) CHECK(none.mass_gradient[i] == 0.0);
@@ -457,7 +459,7 @@ TEST(exact_adjoint_carries_the_motion_of_bodies_that_do_not_yield) {
     CHECK(zone.body_count() == 2);
     const Coordinates upstream = random_upstream(zone, 6);
     AdjointWorkspace workspace;
-    const ZoneAdjoint adjoint = zone_adjoint(zone, point, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
+    const ZoneAdjoint adjoint = zone_adjoint(zone, point, {}, upstream, AdjointMode::exact, GradientNeeds{}, workspace);
     const auto moved = [&](const VectorX& x) {
         Scene changed = scene;
         Pose& start = changed.passive.bodies[0].start;

@@ -24,9 +24,9 @@ TouchingZones zones_of(const std::vector<std::vector<Contact>>& groups, bool wit
     for (int tag = 0; tag < 10; ++tag) exact.push_back({0.5 * tag, 1.0 * tag});
     std::vector<ContactList> lists;
     for (const std::vector<Contact>& group : groups)
-        lists.push_back({group.data(), exact.data(), static_cast<int>(group.size())});
+        lists.push_back({group.data(), exact.data(), nullptr, static_cast<int>(group.size())});
     TouchingZones zones;
-    ZoneFinder().find(model(), {0, 1, 3, 4, 5, 6, 7}, lists, with_exact, one_zone, zones);
+    ZoneFinder().find(model(), {0, 1, 3, 4, 5, 6, 7}, lists, {with_exact, false, one_zone}, zones);
     return zones;
 }
 
@@ -77,8 +77,8 @@ TEST(what_a_finder_held_before_does_not_show) {
     TouchingZones zones;
     const Contact first = contact(0, 1, 0), second = contact(4, kGround, 1);
     const ExactContact exact{0.0, 1.0};
-    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&first, &exact, 1}}, true, false, zones);
-    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&second, &exact, 1}}, false, false, zones);
+    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&first, &exact, nullptr, 1}}, {true, false, false}, zones);
+    finder.find(model(), {0, 1, 3, 4, 5, 6, 7}, {{&second, &exact, nullptr, 1}}, {}, zones);
     CHECK(zones.bodies == Ints({4}));
     CHECK(zones.count() == 3);
     CHECK(zones.exact.empty());

@@ -1,0 +1,36 @@
+#pragma once
+
+#include "adjoint/contact_term.hpp"
+#include "contact/friction.hpp"
+
+/// What the backward of a zone needs of each contact with friction.
+namespace diffsim {
+
+/// Friction of one contact at the solution. Its forces on the coordinates of both sides, Jᵀ λ with λ the force that holds a back,
+/// change with where the sides are and with how they have moved during the step:
+///  * slipping, λ = μ force s/|s| follows the slip s and the contact's own force;
+///  * sticking, λ is whatever keeps the slip where it is: a multiplier of s = 0.
+struct FrictionTerm {
+    std::array<ContactTerm::Side, 2> sides;
+    int side_count = 2;
+    bool sticks = false;
+    // Derivatives along the sides' places (twists, nodes) and their motions (y): columns; rows as the coordinates y.
+    SmallMatrix force_of_place, force_of_motion;
+    // Sticking: the two tangential directions as forces, and the slip along them.
+    Eigen::Matrix<double, Eigen::Dynamic, 2, 0, 18, 2> rows;
+    Eigen::Matrix<double, 2, Eigen::Dynamic, 0, 2, 18> slip_of_place, slip_of_motion;
+    Eigen::Matrix2d symmetric;  ///< slipping: the part along the rows that the symmetric matrix of a solver can hold
+    double stiffness = 0.0;     ///< of the contact itself [kg]
+    SmallVector force;          ///< slipping: on the coordinates y; in proportion to μ and to the contact's stiffness
+
+    /// Call body_part(body, offset) and node_part(node, offset) for everything the term is taken along.
+    template <class BodyPart, class NodePart>
+    void for_each(const BodyPart& body_part, const NodePart& node_part) const {
+        visit_sides(sides, side_count, body_part, node_part);
+    }
+};
+
+FrictionTerm friction_term(
+    const Zone& zone, const ZonePoint& point, const ActiveContact& active, const ContactFriction& friction);
+
+}  // namespace diffsim

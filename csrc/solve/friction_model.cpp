@@ -1,0 +1,304 @@
+#include "solve/friction_model.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "zone/gmres.hpp"
+#include "zone/zone_accuracy.hpp"
+
+namespace diffsim {
+namespace {
+
+constexpr int kMaxNewtonSteps = 100;
+constexpr int kPatience = 10;         // Newton steps before bounds are kept from following
+constexpr double kBoundChange = 0.1;  // of the largest: bounds that change less may follow again
+constexpr int kMaxRounds = 10;        // of bounds that stand still
+constexpr int kMaxSearch = 30;        // bisections of a line search
+constexpr double kFlat = 0.1;         // of the slope at the start: that at the end of a step taken in full
+constexpr double kLinearTolerance = 1e-8;
+constexpr int kMaxLinear = 30;          // iterations of GMRES
+constexpr double kSettledReach = 0.01;  // of its slip
+constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
+
+/// One model; the steps of balance() as members.
+class Balance {
+public:
+    Balance(ContactModel& model, const Zone& zone, BlockSystem& system, BalanceWorkspace& workspace, Coordinates& p)
+        : m_model(model),
+          m_rows(model.rows),
+          m_friction(model.friction),
+          m_zone(zone),
+          m_system(system),
+          m_w(workspace),
+          m_p(p) {}
+
+    ModelSolution run(double tolerance, const SlipScale& scale) {
+        set_reach(scale);
+        look();
+        if (!keep_states()) return m_result;
+        int rounds = 0;
+        for (int steps = 0;; ++steps) {
+            look();
+            follow();
+            set_balance();
+            const double left = largest_scaled(m_zone, m_w.gradient);
+            if (left <= tolerance && m_frozen) {
+                m_frozen = let_bounds_follow() > kBoundChange && ++rounds < kMaxRounds;
+                steps = -1;
+                continue;
+            }
+            m_result.status = left <= tolerance ? ModelSolution::Status::solved : ModelSolution::Status::crawling;
+            if (left <= tolerance || m_result.newton_steps >= kMaxNewtonSteps) break;
+            if (!m_frozen && steps >= kPatience) {
+                m_frozen = true;
+                rounds = 0;
+            }
+            if (!newton_step()) {
+                m_result.status = ModelSolution::Status::indefinite;
+                return m_result;
+            }
+        }
+        keep();
+        return m_result;
+    }
+
+private:
+    double force(std::size_t r) const { return m_rows[r].stiffness * std::max(0.0, m_w.violation[r]); }
+
+    /// Proportional to the load: then all contacts of a face come to their bounds together.
+    void set_reach(const SlipScale& scale) {
+        std::size_t f = 0;
+        visit_runs(m_rows, [&](std::size_t first, std::size_t last) {
+            double sum = 0.0;
+            int count = 0;
+            for (std::size_t r = first; r < last; ++r) {
+                if (!(m_rows[r].force > 0.0)) continue;
+                sum += m_rows[r].force;
+                ++count;
+            }
+            for (; f < m_friction.size() && m_friction[f].normal < last; ++f) {
+                FrictionRow& slip = m_friction[f];
+                const ContactRow& row = m_rows[slip.normal];
+                const double pressed = count > 0 ? sum / count / row.stiffness : row.range;
+                slip.reach = scale.share * slip.coefficient * pressed;
+                const double size = slip.slip.norm();
+                if (scale.is_settled && slip.slips && size > kRestingSlip)
+                    slip.reach = std::min(slip.reach, kSettledReach * size);
+                if (slip.is_known) continue;
+                slip.slips = size > slip.reach;
+                slip.share = slip.slip / std::max(size, slip.reach);
+            }
+        });
+    }
+
+    /// What the rows ask for at p.
+    void look() {
+        m_model.smooth.multiply(m_p, m_w.smooth_p);
+        rows_times(m_rows, m_p, m_w.violation);
+        for (std::size_t r = 0; r < m_rows.size(); ++r) m_w.violation[r] = m_rows[r].missing - m_w.violation[r];
+        slips_times(m_friction, m_rows, m_p, m_w.slip);
+        for (std::size_t f = 0; f < m_friction.size(); ++f)
+            m_w.slip[f] += m_friction[f].slip + m_friction[f].reach * m_friction[f].multiplier;
+    }
+
+    /// Who pushes and who slips at p, and the balance there.
+    void follow() {
+        m_w.pushes.resize(m_rows.size());
+        for (std::size_t r = 0; r < m_rows.size(); ++r) m_w.pushes[r] = m_w.violation[r] > 0.0;
+        m_w.bound.resize(m_friction.size());
+        m_w.pull.resize(m_friction.size());
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            FrictionRow& slip = m_friction[f];
+            const Vec2& w = m_w.slip[f];
+            const double size = w.norm();
+            slip.slips = size > slip.reach;
+            slip.share = w / std::max(size, slip.reach);
+            if (!m_frozen) m_w.bound[f] = slip.coefficient * force(slip.normal);
+            m_w.pull[f] = m_w.bound[f] * slip.share;
+        }
+    }
+
+    /// Of bounds that stood still: how far they are from the forces now, of the largest.
+    double let_bounds_follow() {
+        double change = 0.0, largest = 0.0;
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            const double now = m_friction[f].coefficient * force(m_friction[f].normal);
+            change = std::max(change, std::abs(now - m_w.bound[f]));
+            largest = std::max(largest, now);
+            m_w.bound[f] = now;
+        }
+        return largest > 0.0 ? change / largest : 0.0;
+    }
+
+    /// The balance with these forces, and the symmetric matrix for bounds that stay.
+    bool factorize() {
+        m_system.copy_values(m_model.smooth);
+        m_w.gradient = m_w.smooth_p;
+        add(1.0, m_model.gradient, m_w.gradient);
+        add_rows(m_rows, 1.0, m_w.violation, m_w.pushes, m_w.gradient, &m_system);
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            const FrictionRow& slip = m_friction[f];
+            if (!(m_w.bound[f] > 0.0)) continue;
+            add_friction(slip, m_rows[slip.normal], m_w.pull[f], m_w.gradient);
+            Mat2 stiffness = Mat2::Identity();
+            if (slip.slips) stiffness -= slip.share * slip.share.transpose();
+            stiffness *= m_w.bound[f] / (slip.slips ? std::max(m_w.slip[f].norm(), slip.reach) : slip.reach);
+            add_friction_stiffness(slip, m_rows[slip.normal], stiffness, m_system);
+        }
+        return m_system.factorize();
+    }
+
+    void set_balance() {
+        m_w.gradient = m_w.smooth_p;
+        add(1.0, m_model.gradient, m_w.gradient);
+        add_rows(m_rows, 1.0, m_w.violation, m_w.pushes, m_w.gradient, nullptr);
+        for (std::size_t f = 0; f < m_friction.size(); ++f)
+            if (m_w.bound[f] > 0.0)
+                add_friction(m_friction[f], m_rows[m_friction[f].normal], m_w.pull[f], m_w.gradient);
+    }
+
+    /// What a motion changes the bounds by, as forces: N x.
+    Coordinates change_bounds(const Coordinates& x) {
+        Coordinates result;
+        result.assign_zero(x.bodies.size(), x.nodes.size());
+        rows_times(m_rows, x, m_w.slope);
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            const FrictionRow& slip = m_friction[f];
+            if (!(m_w.bound[f] > 0.0)) continue;
+            const double change = slip.coefficient * m_rows[slip.normal].stiffness * m_w.slope[slip.normal];
+            add_friction(slip, m_rows[slip.normal], change * slip.share, result);
+        }
+        return result;
+    }
+
+    /// The Newton step, by S alone or with what it changes the bounds by.
+    void solve_step(bool with_bounds) {
+        m_w.step = m_w.gradient;
+        scale(-1.0, m_w.step);
+        m_system.solve_in_place(m_w.step);
+        if (!with_bounds) return;
+        const auto apply = [&](const Coordinates& x) {
+            Coordinates result = change_bounds(x);
+            m_system.solve_in_place(result);
+            scale(-1.0, result);
+            add(1.0, x, result);
+            return result;
+        };
+        gmres(m_zone, apply, kLinearTolerance, kMaxLinear, m_w.step);
+    }
+
+    bool bounds_matter() const {
+        if (m_frozen) return false;
+        for (std::size_t f = 0; f < m_friction.size(); ++f)
+            if (m_w.bound[f] > 0.0 && !m_friction[f].share.isZero(0.0)) return true;
+        return false;
+    }
+
+    /// From the forces of the model before, linearly and every contact as it was: forces are carried from model to model, not
+    /// places, at which other springs have other forces and everything that sticks seems to slip.
+    bool keep_states() {
+        m_w.pushes.resize(m_rows.size());
+        bool any = false;
+        for (std::size_t r = 0; r < m_rows.size(); ++r) any = (m_w.pushes[r] = m_rows[r].force > 0.0) || any;
+        if (!any) return true;
+        m_w.bound.resize(m_friction.size());
+        m_w.pull.resize(m_friction.size());
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            const FrictionRow& slip = m_friction[f];
+            const ContactRow& row = m_rows[slip.normal];
+            m_w.bound[f] = slip.coefficient * row.force;
+            const double now = row.force > 0.0 ? slip.coefficient * row.stiffness * m_w.violation[slip.normal] : 0.0;
+            m_w.pull[f] = now * slip.share;
+            if (!slip.slips) m_w.pull[f] += m_w.bound[f] * (m_w.slip[f] / slip.reach - slip.share);
+        }
+        if (!factorize()) return false;
+        ++m_result.newton_steps;
+        solve_step(bounds_matter());
+        add(1.0, m_w.step, m_p);
+        return true;
+    }
+
+    bool newton_step() {
+        if (!factorize()) return false;
+        ++m_result.newton_steps;
+        const bool with_bounds = bounds_matter();
+        solve_step(with_bounds);
+        measure_step();
+        std::vector<double> bound = m_w.bound;
+        if (with_bounds) {
+            for (std::size_t f = 0; f < m_friction.size(); ++f) {
+                const FrictionRow& slip = m_friction[f];
+                const std::size_t r = slip.normal;
+                if (bound[f] > 0.0)
+                    bound[f] = slip.coefficient * m_rows[r].stiffness * std::max(0.0, m_w.violation[r] - m_w.slope[r]);
+            }
+            if (slope(0.0, bound) > 0.0) {  // with these bounds it leads up
+                bound = m_w.bound;
+                solve_step(false);
+                measure_step();
+            }
+        }
+        add(line_search(bound), m_w.step, m_p);
+        return true;
+    }
+
+    void measure_step() {
+        rows_times(m_rows, m_w.step, m_w.slope);
+        slips_times(m_friction, m_rows, m_w.step, m_w.slip_step);
+        m_model.smooth.multiply(m_w.step, m_w.smooth_step);
+        m_first = dot(m_w.step, m_model.gradient) + dot(m_w.step, m_w.smooth_p);
+        m_second = dot(m_w.step, m_w.smooth_step);
+    }
+
+    /// That of the convex energy whose bounds stay as they are, along the step.
+    double slope(double t, const std::vector<double>& bound) const {
+        double sum = m_first + t * m_second;
+        for (std::size_t r = 0; r < m_rows.size(); ++r) {
+            const double v = m_w.violation[r] - t * m_w.slope[r];
+            if (v > 0.0) sum -= m_rows[r].stiffness * v * m_w.slope[r];
+        }
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            if (!(bound[f] > 0.0)) continue;
+            const Vec2 w = m_w.slip[f] + t * m_w.slip_step[f];
+            sum += bound[f] * w.dot(m_w.slip_step[f]) / std::max(w.norm(), m_friction[f].reach);
+        }
+        return sum;
+    }
+
+    double line_search(const std::vector<double>& bound) const {
+        const double begin = slope(0.0, bound);
+        if (slope(1.0, bound) <= kFlat * std::abs(begin)) return 1.0;
+        double lower = 0.0, upper = 1.0;
+        for (int k = 0; k < kMaxSearch; ++k) {
+            const double t = 0.5 * (lower + upper), now = slope(t, bound);
+            if (std::abs(now) <= kFlat * std::abs(begin)) return t;
+            (now > 0.0 ? upper : lower) = t;
+        }
+        return 0.5 * (lower + upper);
+    }
+
+    void keep() {
+        for (std::size_t r = 0; r < m_rows.size(); ++r) m_rows[r].force = force(r);
+    }
+
+    ContactModel& m_model;
+    std::vector<ContactRow>& m_rows;
+    std::vector<FrictionRow>& m_friction;
+    const Zone& m_zone;
+    BlockSystem& m_system;
+    BalanceWorkspace& m_w;
+    Coordinates& m_p;
+    double m_first = 0.0, m_second = 0.0;  // slope of the smooth part along the step, and its rate
+    bool m_frozen = false;                 // bounds stay as they are: the model is a convex minimisation for a while
+    ModelSolution m_result;
+};
+
+}  // namespace
+
+ModelSolution balance(
+    ContactModel& model, const Zone& zone, double tolerance, const SlipScale& scale, BlockSystem& system,
+    BalanceWorkspace& workspace, Coordinates& p) {
+    return Balance(model, zone, system, workspace, p).run(tolerance, scale);
+}
+
+}  // namespace diffsim

@@ -1,0 +1,37 @@
+#pragma once
+
+#include "solve/contact_model.hpp"
+
+/// The model of a zone with friction: where the forces of all near contacts are in balance.
+///
+/// With force_r = stiffness max(0, missing - rowᵀ p) the rows' forces, a contact that slips by s(p) is held by
+///     f = μ force u,   u = w / max(|w|, reach),   w = s(p) + reach · multiplier,
+/// which is Coulomb's law but for the slip that a sticking contact has against its multiplier; that of the next model takes it over.
+/// The bound follows the force inside the model, so that this is no minimum: the solution of
+///     H p + g - Σ force row + Σ rows_s μ force u = 0
+/// is found by Newton's method, whose matrix S - N is not symmetric: S is what it is for bounds that stay as they are, N what
+/// they change by. GMRES with the factor of S solves with it.
+namespace diffsim {
+
+/// Memory of balance(), kept from model to model.
+struct BalanceWorkspace {
+    Coordinates smooth_p, gradient, step, smooth_step;
+    std::vector<double> violation, slope, bound;
+    std::vector<char> pushes;
+    std::vector<Vec2> slip, slip_step, pull;
+};
+
+/// How the slip of contacts is regularised; see FrictionRow::reach.
+struct SlipScale {
+    double share = 0.1;       ///< of what a bound presses its contact by
+    bool is_settled = false;  ///< contacts that slip go on: their direction is made exact
+};
+
+/// Solve until no more than `tolerance` is left of the balance, in units of |L⁻¹ g|. `p` holds the start, which pinned nodes
+/// keep, and receives the solution; rows receive their forces and states. Scratch: `system`, whose pattern is that of
+/// model.smooth.
+ModelSolution balance(
+    ContactModel& model, const Zone& zone, double tolerance, const SlipScale& scale, BlockSystem& system,
+    BalanceWorkspace& workspace, Coordinates& p);
+
+}  // namespace diffsim

@@ -1,0 +1,57 @@
+#include "solve/model_direction.hpp"
+
+/// What friction adds to the models of a zone.
+namespace diffsim {
+
+/// What sticks is held by the springs of one model, and by the next one's from there on.
+void ModelDirection::advance_multipliers() {
+    for (FrictionState& state : m_friction) state.multiplier = state.share;
+    for (Kept& kept : m_kept) kept.friction.multiplier = kept.friction.share;
+}
+
+void ModelDirection::add_friction_forces(Coordinates& gradient) const {
+    if (m_friction.empty() || m_list != m_path.list_number()) return;
+    const Placement at{m_point.y, m_point.poses, m_point.nodes};
+    for (const ActiveContact& active : m_point.active) {
+        const FrictionState& state = m_friction[static_cast<std::size_t>(active.index)];
+        if (!state.is_known) continue;
+        const ZoneContact& contact = m_zone.contacts[active.index];
+        const ContactGeometry& geometry = active.geometry;
+        const double force =
+            edge_mollifier(geometry.sine_sq).value * normal_force(contact.law, geometry.distance).force;
+        if (!(contact.law.friction * force > 0.0)) continue;
+        const ContactRow row = make_row(m_zone, contact, geometry, at, at.y, 0.0);
+        FrictionRow slip = make_friction_row(m_zone, contact, geometry, at, at.y);
+        slip.set_state(state);
+        add_friction(slip, row, contact.law.friction * force * slip.share, gradient);
+    }
+}
+
+double ModelDirection::friction_work(double step) const {
+    const auto energy = [](const Vec2& slip, double reach) {
+        const double size = slip.norm();
+        return size > reach ? size - 0.5 * reach : 0.5 * size * size / reach;
+    };
+    std::vector<Vec2> moved;
+    slips_times(m_model.friction, m_model.rows, m_way, moved);
+    double sum = 0.0;
+    for (std::size_t f = 0; f < m_model.friction.size(); ++f) {
+        const FrictionRow& slip = m_model.friction[f];
+        const double bound = slip.coefficient * m_model.rows[slip.normal].force;
+        if (!(bound > 0.0)) continue;
+        sum += bound * (energy(slip.slip + step * moved[f], slip.reach) - energy(slip.slip, slip.reach));
+    }
+    return sum;
+}
+
+/// Of the last row.
+void ModelDirection::add_friction_row(const NearContact& near, const ContactGeometry& geometry) {
+    const ZoneContact& contact = m_zone.contacts[near.contact];
+    if (!(contact.law.friction > 0.0)) return;
+    FrictionRow slip = make_friction_row(m_zone, contact, geometry, m_at, m_point.y);
+    slip.normal = m_model.rows.size() - 1;
+    slip.set_state(m_friction[static_cast<std::size_t>(near.contact)]);
+    m_model.friction.push_back(std::move(slip));
+}
+
+}  // namespace diffsim
