@@ -98,7 +98,7 @@ def rollout(
     single: bool = False,
     first_step: int = 0,
 ) -> OptionalTensors:
-    """As `diffsim.ops.rollout`, for code that is traced. `values`: the parameters of the call, restitution among them."""
+    """As `diffsim.ops.rollout`, for code that is traced. `values`: the parameters of the call, also those not read."""
     record = keep_tape and torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     settings = (owner, steps, controls_have_time, keep_time, record, single, first_step)
     outputs = torch.ops.diffsim.rollout(*settings, *inputs, values["restitution"])
