@@ -57,6 +57,8 @@ class Info:
     #: (1.5 times its radius): such bodies can come around each other within a few steps
     fast_impacts: int
     contacts: int  #: contacts in the zones' optimizations
+    sticking: int  #: those of them with friction that do not slip
+    slipping: int  #: and those that do
     zones: int  #: independent groups of bodies and cloths in contact
     largest_zone: int  #: bodies and cloths in the largest of them
     iterations: int  #: Newton iterations of the zone that took most
@@ -173,6 +175,8 @@ def combined(segments: list[Any], names: Sequence[str]) -> Info:
         failure=failures[0].reason if failures else "",
         failures=failures[:_MAX_FAILURES],
         contacts=last.contacts,
+        sticking=last.sticking,
+        slipping=last.slipping,
         zones=last.zones,
         largest_zone=last.largest_zone,
         iterations=last.iterations,

@@ -26,8 +26,9 @@ class Contacts:
     """The k contacts that push at the end of a step, from `Simulator.contacts`.
 
     A face on a face has several, one per corner, or where edges cross. All in the world frame. `position`, `normal`,
-    `distance` and `force` are differentiable with respect to what the step is differentiable in; which contacts there
-    are is not.
+    `distance` and `normal_force` are differentiable with respect to what the step is differentiable in; which contacts
+    there are is not. `friction`, and with it `force`, refuses a gradient where there is some: where the step ends does
+    not tell what holds a contact that sticks.
     """
 
     #: indices of the two objects, numbered as `Simulator.friction`: bodies, cloths, the ground; int64, shape (k, 2)
@@ -38,8 +39,14 @@ class Contacts:
     normal: Tensor
     #: between the meshes, margins not taken off, shape (k,)  [m]
     distance: Tensor
-    #: on the first object, along `normal`, at the end of the step; the second gets the opposite, shape (k, 3)  [N]
+    #: on the first object, at the end of the step; the second gets the opposite, shape (k, 3)  [N]
     force: Tensor
+    #: what of `force` is along `normal`, shape (k, 3)  [N]
+    normal_force: Tensor
+    #: what of it is across: Coulomb friction, at most μ times the other, shape (k, 3)  [N]
+    friction: Tensor
+    #: whether the contact has friction and does not slip; bool, shape (k,)
+    sticking: Tensor
     #: index along the batch axis, 0 without one; int64, shape (k,)
     scene: Tensor
     #: after the step: what ``sim(state, control)`` returns
@@ -124,14 +131,23 @@ def contacts_from(
     if hard:
         magnitude = _HardForce.apply(magnitude)  # type: ignore[no-untyped-call]
     magnitude = magnitude * (1.0 + _change(_log_mollifier(core["sine_sq"], first, second)))
-    normal = core["normal"] + _change(normal)
+    change_of_normal = _change(normal)
+    normal = core["normal"] + change_of_normal
+    normal_force = magnitude[:, None] * normal
+    force, friction = normal_force, core["friction"]
+    if friction.any():
+        friction = _FrictionForce.apply(friction + change_of_normal)  # type: ignore[no-untyped-call]
+        force = normal_force + friction
     middle = core["point"].mean(dim=1) + _change(point - 0.5 * offset)
     return Contacts(
         objects=core["objects"],
         position=middle.to(end.dtype),
         normal=normal.to(end.dtype),
         distance=(core["distance"] + _change(distance)).to(end.dtype),
-        force=(magnitude[:, None] * normal).to(end.dtype),
+        force=force.to(end.dtype),
+        normal_force=normal_force.to(end.dtype),
+        friction=friction.to(end.dtype),
+        sticking=core["sticking"].to(torch.bool),
         scene=core["scene"],
         end=end,
         object_names=object_names,
@@ -149,6 +165,20 @@ class _HardForce(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> Tensor:
         raise NotImplementedError(
             "contacts: forces of hard contacts (compliance=0) have no gradient; with the default compliance they have"
+        )
+
+
+class _FrictionForce(torch.autograd.Function):
+    """What holds contacts across their normals: where the step ends does not tell it of those that stick."""
+
+    @staticmethod
+    def forward(ctx: Any, force: Tensor) -> Tensor:
+        return force.view_as(force)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        raise NotImplementedError(
+            "contacts: forces of friction have no gradient; take normal_force, or the momentum of the state itself"
         )
 
 

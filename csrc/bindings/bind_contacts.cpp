@@ -43,6 +43,8 @@ public:
         m_sine_sq.push_back(contact.sine_sq);
         m_force.push_back(contact.force);
         m_stiffness.push_back(contact.stiffness);
+        m_sticking.push_back(contact.sticks ? 1 : 0);
+        append(m_friction, contact.friction);
         append(m_normal, contact.normal);
         for (const ContactReadout::Side& side : contact.sides) {
             m_object.push_back(side.object == kGround ? model.body_count() + model.cloth_count() : side.object);
@@ -68,6 +70,8 @@ public:
         result["distance"] = shaped(m_distance, {k});
         result["sine_sq"] = shaped(m_sine_sq, {k});
         result["force"] = shaped(m_force, {k});
+        result["friction"] = shaped(m_friction, {k, 3});
+        result["sticking"] = shaped(m_sticking, {k});
         result["stiffness"] = shaped(m_stiffness, {k});
         result["mass_exponent"] = shaped(m_mass_exponent, {k, 2});
         result["point"] = shaped(m_point, {k, 2, 3});
@@ -89,9 +93,9 @@ private:
         return py::array_t<T>(shape, values.data());
     }
 
-    std::vector<std::int64_t> m_scene, m_object, m_slide_count, m_nodes;
-    std::vector<double> m_normal, m_distance, m_sine_sq, m_force, m_stiffness, m_mass_exponent, m_point, m_edge,
-        m_slides, m_weights, m_slide_weights;
+    std::vector<std::int64_t> m_scene, m_sticking, m_object, m_slide_count, m_nodes;
+    std::vector<double> m_normal, m_distance, m_sine_sq, m_force, m_friction, m_stiffness, m_mass_exponent, m_point,
+        m_edge, m_slides, m_weights, m_slide_weights;
 };
 
 py::dict bound_contacts(const std::shared_ptr<Tape>& tape, const InputArrays& inputs) {

@@ -200,6 +200,8 @@ void bind_rollout(py::module_& module) {
         .def_property_readonly("failures", &failures)
         .def_property_readonly("scenes_converged", &scenes_converged)
         .def_property_readonly("contacts", [](const RolloutInfo& info) { return info.last.contacts; })
+        .def_property_readonly("sticking", [](const RolloutInfo& info) { return info.last.sticking; })
+        .def_property_readonly("slipping", [](const RolloutInfo& info) { return info.last.slipping; })
         .def_property_readonly("zones", [](const RolloutInfo& info) { return info.last.zones; })
         .def_property_readonly("largest_zone", [](const RolloutInfo& info) { return info.last.largest_zone; })
         .def_property_readonly("iterations", [](const RolloutInfo& info) { return info.last.iterations; })

@@ -27,6 +27,8 @@ void write_state(const SceneState& state, const TrajectoryArrays<double>& out, i
 void merge_info(StepInfo& total, const StepInfo& scene) {
     total.converged = total.converged && scene.converged;
     total.contacts += scene.contacts;
+    total.sticking += scene.sticking;
+    total.slipping += scene.slipping;
     total.zones += scene.zones;
     total.largest_zone = std::max(total.largest_zone, scene.largest_zone);
     total.iterations = std::max(total.iterations, scene.iterations);

@@ -37,11 +37,14 @@ public:
     void aim_for(const BalanceGoal& goal) { m_goal = goal; }
 
     /// Add what friction does at the point, its contacts' shares of their bounds being those of the last model.
-    void add_friction_forces(Coordinates& gradient) const;
+    void add_friction_forces(Coordinates& gradient);
     /// What friction takes up on this part of the last way, its bounds those of the last model.
     double friction_work(double step) const;
     /// The states of the last model, one per contact of the zone.
-    const std::vector<FrictionState>& friction() const { return m_friction; }
+    const std::vector<FrictionState>& friction() {
+        recall_forces();
+        return m_friction;
+    }
 
     /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts is
     /// made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then, none is found:

@@ -9,8 +9,8 @@ void ModelDirection::advance_multipliers() {
     for (Kept& kept : m_kept) kept.friction.multiplier = kept.friction.share;
 }
 
-void ModelDirection::add_friction_forces(Coordinates& gradient) const {
-    if (m_friction.empty() || m_list != m_path.list_number()) return;
+void ModelDirection::add_friction_forces(Coordinates& gradient) {
+    recall_forces();
     const Placement at{m_point.y, m_point.poses, m_point.nodes};
     for (const ActiveContact& active : m_point.active) {
         const FrictionState& state = m_friction[static_cast<std::size_t>(active.index)];

@@ -9,45 +9,27 @@
 #include "solve/model_direction.hpp"
 #include "solve/multiplier_rounds.hpp"
 #include "solve/newton_direction.hpp"
-#include "solve/zone_path.hpp"
-#include "zone/zone_accuracy.hpp"
+#include "solve/zone_balance.hpp"
 
 namespace diffsim {
 namespace {
 
 constexpr double kArmijo = 1e-4;
 constexpr int kMaxHalvings = 50;
-constexpr int kMaxStalls = 3;             // steps in a row that get a driven body nowhere
-constexpr double kStall = 1e-3;           // of the way that is left
-constexpr double kSqueeze = 0.1;          // of the way that is left: where something is squeezed, less is no progress
 constexpr double kExactTolerance = 1e-9;  // on an exact contact's distance, of its range
 constexpr int kMaxMultiplierRounds = 50;
-constexpr double kNearSolution = 1e-4;   // residual below which the plain Newton step ends it
-constexpr int kMaxModelFactors = 1000;   // of a zone with cloth: from there on impacts just stop it
-constexpr double kGoodEnough = 1e3;      // times the tolerance: enough where rounding hides all further descent
-constexpr int kStagnantSteps = 6;        // without halving the residual: rounding's sign
-constexpr int kFutileSteps = 50;         // without a lower energy: there is none to be found
-constexpr double kContraction = 0.1;     // of the residual: steps with an old factor that do less are not worth it
-constexpr double kSettled = 1e-2;        // residual below which statuses of contacts with friction mostly stay
-constexpr double kSlipSettled = 1e-3;    // the same: from there on what is left is the multipliers'
-constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models with friction are solved
-constexpr int kMaxDamped = 4;   // models in a row: what friction takes up is known of the last model's bounds alone
-constexpr double kRest = 1e-9;  // of the forces: a model that moves nothing further has found the balance
-constexpr double kSlow = 0.2, kStiffer = 30.0, kLeastReach = 3e-3;  // multipliers that leave more; see SlipScale
-constexpr double kHeld = 0.1;      // of the way to its target: a body that moved less is held by something
-constexpr double kShortWay = 0.1;  // of a body's radius
+constexpr double kNearSolution = 1e-4;  // residual below which the plain Newton step ends it
+constexpr int kMaxModelFactors = 1000;  // of a zone with cloth: from there on impacts just stop it
+constexpr int kStagnantSteps = 6;       // without halving the residual: rounding's sign
+constexpr int kFutileSteps = 50;        // without a lower energy: there is none to be found
+constexpr double kContraction = 0.1;    // of the residual: steps with an old factor that do less are not worth it
+constexpr double kHeld = 0.1;           // of the way to its target: a body that moved less is held by something
+constexpr double kShortWay = 0.1;       // of a body's radius
 
 /// State of one solve; the steps of solve_zone as members.
-class ZoneSolver {
+class ZoneSolver : private ZoneSearch {
 public:
-    ZoneSolver(
-        Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-        std::vector<Box>& visited)
-        : m_zone(zone),
-          m_options(options),
-          m_w(workspace),
-          m_visited(visited),
-          m_path(zone, passive, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
+    using ZoneSearch::ZoneSearch;
 
     ZoneResult solve() {
         start();
@@ -59,9 +41,8 @@ public:
         if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
         go_to_warm_start();
         if (m_zone.friction != nullptr) {
-            find_balance();
+            find_balance(*this, *m_model);
             if (m_zone.exact_contact) multiplier_rounds();
-            keep_friction();
             return m_result;
         }
         m_near =
@@ -72,7 +53,6 @@ public:
     }
 
 private:
-    Coordinates& y() { return m_w.point.y; }
     bool is_one_body() const { return m_zone.dynamic_count == 1 && m_zone.nodes.empty(); }
 
     // --- start -------------------------------------------------------------------------------------------------
@@ -116,16 +96,6 @@ private:
         }
     }
 
-    void mark_visited() {
-        for (int i = 0; i < m_zone.dynamic_count; ++i)
-            m_visited[i].include(transformed(m_zone.mesh(i).tree.nodes[0].box, m_w.point.poses[i]));
-        for (int c = 0; c < static_cast<int>(m_zone.cloths.size()); ++c) {
-            Box& box = m_visited[static_cast<std::size_t>(m_zone.dynamic_count + c)];
-            const int first = m_zone.cloths[c].first_node;
-            for (int i = first; i < first + m_zone.cloth(c).node_count(); ++i) box.include(m_w.point.nodes[i]);
-        }
-    }
-
     /// Nothing touches on the way to the target and there: done without an iteration.
     bool try_free_motion() {
         m_w.y_end.bodies.resize(m_zone.bodies.size());
@@ -161,36 +131,7 @@ private:
         if (step > 0.0 && m_w.trial.energy <= m_w.point.energy) accept_trial();
     }
 
-    // --- moving ------------------------------------------------------------------------------------------------
-
-    void accept_trial() {
-        std::swap(m_w.point, m_w.trial);
-        mark_visited();
-    }
-
-    bool drives_done() const {
-        for (int i = m_zone.dynamic_count; i < m_zone.body_count(); ++i)
-            if (m_w.point.y.bodies[i] != m_zone.bodies[i].target) return false;
-        for (int i = 0; i < m_zone.node_count(); ++i)
-            if (m_zone.nodes[i].pinned && m_w.point.y.nodes[i] != m_zone.nodes[i].target) return false;
-        return true;
-    }
-
     // --- Newton ------------------------------------------------------------------------------------------------
-
-    /// Where nothing pushes, a contact within rounding of its rest distance may be found to push or not.
-    Accuracy current_accuracy() {
-        double& stiffness = m_w.derivatives.largest_stiffness;
-        for (std::size_t k = 0; m_w.point.active.empty() && k < m_zone.contacts.size(); ++k) {
-            const ZoneContact& contact = m_zone.contacts[k];
-            if (m_w.point.distances[k] > contact.law.range.rest + 16.0 * kEpsilon * m_path.position()) continue;
-            for (int body : {contact.a, contact.b})
-                if (m_zone.yields(body))
-                    stiffness = std::max(stiffness, contact.law.stiffness.value / std::sqrt(m_zone.bodies[body].mass));
-        }
-        return accuracy(m_zone, m_w.derivatives, m_path.position());
-    }
-    double current_noise() { return energy_noise(m_zone, m_w.point, m_w.system, m_path.position(), m_w.pushed); }
 
     double slope(const Coordinates& gradient) const {
         double sum = 0.0;
@@ -335,84 +276,6 @@ private:
         }
     }
 
-    // --- friction ----------------------------------------------------------------------------------------------
-
-    /// One model after the other to the end: with friction there is no energy to go down on.
-    void find_balance() {
-        int stalls = 0, slow = 0, damped = 0;
-        double last_motion = kInfinity;
-        SlipScale scale;
-        for (m_result.iterations = 0;; ++m_result.iterations) {
-            if (m_options.interrupt != nullptr) m_options.interrupt->throw_if_asked();
-            const bool driven = drives_done();
-            differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
-            m_balance = m_w.derivatives.gradient;
-            m_model->add_friction_forces(m_balance);
-            Accuracy now = current_accuracy();
-            now.residual = now.reference > 0.0 ? largest_scaled(m_zone, m_balance) / now.reference : 0.0;
-            m_result.residual = now.residual;
-            if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
-            const double wanted = std::max(m_options.tolerance, now.floor);
-            scale.is_settled = now.residual < kSettled;
-            m_model->aim_for(
-                {std::max(0.7 * wanted, kModelAccuracy * std::min(1.0, now.residual)) * now.reference, scale,
-                 now.residual < kSettled});
-            const ModelDirection::Way way = m_model->find(m_w.derivatives.gradient, driven, m_w.y_end);
-            if (!way.found) return fail(ZoneStatus::no_descent);
-            set_step_to_end();
-            const double motion = largest_motion(m_zone, m_w.step);
-            if (driven && way.free == 1.0 && now.residual < kGoodEnough * wanted && motion <= kRest * now.reference &&
-                m_result.iterations > 0) {
-                m_w.trial.y = m_w.y_end;
-                evaluate(m_zone, m_w.trial, &m_w.point);
-                accept_trial();
-                return;
-            }
-            // Where sticking works against other springs multipliers are slow; stiffer ones leave less to them.
-            slow = now.residual < kSlipSettled && motion > kSlow * last_motion ? slow + 1 : 0;
-            if (slow >= 2) {
-                scale.share = std::max(scale.share / kStiffer, kLeastReach);
-                slow = 0;
-            }
-            last_motion = motion;
-            const double step = m_path.covered_step(m_w.y_end, way.free);
-            if (!driven) {
-                const DriveProgress progress = advance_drives(step, stalls);
-                if (progress == DriveProgress::blocked) return fail(ZoneStatus::blocked);
-                if (progress == DriveProgress::moved) accept_trial();
-                if (way.squeezes && step < kSqueeze) return fail(ZoneStatus::blocked);
-                continue;
-            }
-            m_path.set_trial(m_w.y_end, step);
-            if (step == 1.0) m_w.trial.y = m_w.y_end;
-            evaluate(m_zone, m_w.trial, &m_w.point);
-            const double change = m_w.trial.energy - m_w.point.energy + m_model->friction_work(step);
-            if (now.residual > kSettled && change > current_noise() && damped < kMaxDamped) {
-                ++damped;
-                m_model->damp(m_w.trial, change);
-                continue;
-            }
-            damped = 0;
-            accept_trial();
-            m_model->relax();
-        }
-    }
-
-    /// The way to y_end as a step.
-    void set_step_to_end() {
-        m_w.step.resize(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.step.bodies[i] = m_w.y_end.bodies[i] - y().bodies[i];
-        for (int i = 0; i < m_zone.node_count(); ++i) m_w.step.nodes[i] = m_w.y_end.nodes[i] - y().nodes[i];
-    }
-
-    /// The states of the contacts that push in the end.
-    void keep_friction() {
-        const std::vector<FrictionState>& states = m_model->friction();
-        m_w.friction.resize(m_w.point.active.size());
-        for (std::size_t k = 0; k < m_w.friction.size() && !states.empty(); ++k)
-            m_w.friction[k] = states[static_cast<std::size_t>(m_w.point.active[k].index)];
-    }
-
     /// Near a point of balance that is a saddle of the energy, where descent hardly moves: go off it along negative curvature,
     /// by the largest part of the contacts' range that lowers the energy. Once is enough: from there descent goes on.
     bool leave_saddle(const Accuracy& now) {
@@ -497,15 +360,6 @@ private:
         return ModelStep::taken;
     }
 
-    /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
-    /// Where there is no room at all, what is in the way may make some in Newton steps of its own.
-    enum class DriveProgress { moved, waits, blocked };
-    DriveProgress advance_drives(double step, int& stalls) {
-        stalls = step < kStall ? stalls + 1 : 0;
-        if (stalls > kMaxStalls) return DriveProgress::blocked;
-        return step > 0.0 && m_path.clear_step(m_w.y_end) > 0.0 ? DriveProgress::moved : DriveProgress::waits;
-    }
-
     /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel. False if there
     /// is nothing to gain.
     bool polish() {
@@ -526,27 +380,18 @@ private:
             if (violation <= kExactTolerance) return;
             if (round >= kMaxMultiplierRounds) return fail(ZoneStatus::too_many_iterations);
             m_path.shift_contacts(m_rounds.stiffening(m_zone, violation));
-            m_zone.friction != nullptr ? find_balance() : iterate();
+            m_zone.friction != nullptr ? find_balance(*this, *m_model) : iterate();
         }
     }
 
-    void fail(ZoneStatus status) { m_result.status = status; }
-
-    const Zone& m_zone;  // its contacts change by m_path alone
-    const ZoneOptions& m_options;
-    ZoneWorkspace& m_w;
-    std::vector<Box>& m_visited;
-    ZonePath m_path;
     MultiplierRounds m_rounds;
     std::optional<ModelDirection> m_model;  // made when first asked: most bodies at rest never do
     NewtonDirection m_newton;
     bool m_trial_is_differentiated = false;  // the one that the line search accepted
     bool m_newton_full = false;              // the last line search took the whole step
-    Coordinates m_balance;                   // what is left of it, friction included
     int m_model_factors = 0;                 // of models with cloth so far
     bool m_left_saddle = false;
     bool m_near = false;  // the last model step was a Newton step: nothing that pushes changed
-    ZoneResult m_result;
 };
 
 }  // namespace

@@ -48,7 +48,9 @@ ContactReadout::Side read_side(
     return result;
 }
 
-ContactReadout read_contact(const Zone& zone, const ZonePoint& point, const ActiveContact& active, double dt) {
+/// `friction`: null in a zone without.
+ContactReadout read_contact(
+    const Zone& zone, const ZonePoint& point, const ActiveContact& active, const ContactFriction* friction, double dt) {
     const ZoneContact& contact = zone.contacts[active.index];
     const ContactGeometry& geometry = active.geometry;
     const PotentialValue potential = normal_force(contact.law, geometry.distance);
@@ -70,6 +72,9 @@ ContactReadout read_contact(const Zone& zone, const ZonePoint& point, const Acti
     }
     result.force = share * potential.force;
     result.stiffness = share * potential.stiffness;
+    if (friction == nullptr || !(contact.law.friction > 0.0)) return result;
+    result.friction = -contact.law.friction * result.force * (friction->share - n * n.dot(friction->share));
+    result.sticks = !friction->slips;
     return result;
 }
 
@@ -84,8 +89,11 @@ std::vector<ContactReadout> read_contacts(
     std::vector<ContactReadout> result;
     for (int k = 0; k < zones.count(); ++k) {
         zones.rebuild(k, memory, local);
-        for (const ActiveContact& active : memory.workspace.point.active) {
-            result.push_back(read_contact(memory.zone, memory.workspace.point, active, options.dt));
+        const ZonePoint& point = memory.workspace.point;
+        const std::vector<ContactFriction>& friction = memory.workspace.friction;
+        for (std::size_t i = 0; i < point.active.size(); ++i) {
+            result.push_back(read_contact(
+                memory.zone, point, point.active[i], friction.empty() ? nullptr : &friction[i], options.dt));
             if (result.back().force == 0.0) result.pop_back();  // parallel edges
         }
     }

@@ -24,11 +24,13 @@ struct ContactReadout {
         double mass_exponent = 0.0;  ///< d(log stiffness)/d(log mass) of the object
     };
     std::array<Side, 2> sides;
-    Vec3 normal = Vec3::Zero();  ///< unit, from the second object to the first
-    double distance = 0.0;       ///< between the bare meshes [m]
-    double sine_sq = 1.0;        ///< of the angle between two edges, which the force is mollified by
-    double force = 0.0;          ///< on the first object, along the normal [N]
-    double stiffness = 0.0;      ///< -d(force)/d(distance); meaningless where contacts are hard [N/m]
+    Vec3 normal = Vec3::Zero();    ///< unit, from the second object to the first
+    double distance = 0.0;         ///< between the bare meshes [m]
+    double sine_sq = 1.0;          ///< of the angle between two edges, which the force is mollified by
+    Vec3 friction = Vec3::Zero();  ///< on the first object, across the normal [N]
+    bool sticks = false;           ///< it has friction and does not slip
+    double force = 0.0;            ///< on the first object, along the normal [N]
+    double stiffness = 0.0;        ///< -d(force)/d(distance); meaningless where contacts are hard [N/m]
 };
 
 /// Those of a step. In the order of its record: zone by zone, then by objects and features.

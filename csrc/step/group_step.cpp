@@ -1,6 +1,7 @@
 #include "step/group_step.hpp"
 
 #include <algorithm>
+#include <utility>
 
 #include "model/number_text.hpp"
 #include "step/cloth_step.hpp"
@@ -16,6 +17,10 @@ void keep_contacts(
     const Zone& zone, const ZonePoint& point, const std::vector<ContactFriction>* friction, GroupOutcome& outcome,
     GroupResults& results) {
     outcome.first_contact = static_cast<int>(results.contacts.size());
+    const auto pair_of = [&](const ActiveContact& active) {
+        return zone.contacts.contacts[static_cast<std::size_t>(active.index)].pair;
+    };
+    int held = 0;  // contacts of the pair at hand that stick
     for (std::size_t k = 0; k < point.active.size(); ++k) {
         const ActiveContact& active = point.active[k];
         const ZoneContact& contact = zone.contacts[active.index];
@@ -30,7 +35,13 @@ void keep_contacts(
         hash = mix(hash, pack(c.object_a, static_cast<std::uint32_t>(c.object_b)));
         hash = mix(hash, pack(c.feature_a, static_cast<std::uint32_t>(c.feature_b)));
         hash = mix(hash, pack(static_cast<int>(c.type), active.geometry.closest.feature_code));
-        if (friction != nullptr) hash = mix(hash, results.friction.back().slips ? 1 : 0);
+        if (friction == nullptr) continue;
+        if (law.friction > 0.0) ++(results.friction.back().slips ? outcome.slipping : held);
+        const bool ends_pair = k + 1 == point.active.size() || pair_of(point.active[k + 1]) != pair_of(active);
+        if (!ends_pair) continue;
+        // Which of a face's contacts are at their bounds is rounding's choice: two that stick hold all of it.
+        hash = mix(hash, static_cast<std::uint64_t>(std::min(held, 2)));
+        outcome.sticking += std::exchange(held, 0);
     }
     outcome.contact_end = static_cast<int>(results.contacts.size());
 }

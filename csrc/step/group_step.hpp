@@ -15,6 +15,7 @@ struct GroupOutcome {
     int thread = 0;                          ///< that solved it
     int first_contact = 0, contact_end = 0;  ///< active contacts, in that thread's GroupResults
     double max_compression = 0.0;
+    int sticking = 0, slipping = 0;  ///< contacts with friction
     std::uint64_t signature = 0;
 };
 

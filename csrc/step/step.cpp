@@ -368,6 +368,8 @@ private:
             note(outcome.result);
             if (outcome.result.status != ZoneStatus::converged) fail_group(root);
             m_info.fast_impacts += outcome.result.fast_impacts;
+            m_info.sticking += outcome.sticking;
+            m_info.slipping += outcome.slipping;
             m_info.max_compression = std::max(m_info.max_compression, outcome.max_compression);
             m_info.signature = mix(m_info.signature, outcome.signature);
         }

@@ -35,6 +35,7 @@ struct StepInfo {
     bool converged = true;
     ZoneStatus status = ZoneStatus::converged;  ///< of the first zone that did not converge
     int contacts = 0;
+    int sticking = 0, slipping = 0;  ///< of those with friction
     int zones = 0;         ///< groups of bodies and cloths in contact
     int largest_zone = 0;  ///< bodies and cloths
     int iterations = 0;    ///< Newton steps of the zone that took most

@@ -1,0 +1,126 @@
+#include "solve/zone_balance.hpp"
+
+#include <algorithm>
+
+#include "parallel/interrupt.hpp"
+
+namespace diffsim {
+namespace {
+
+constexpr double kSettled = 1e-2;        // residual below which contacts mostly go on sticking or slipping
+constexpr double kSlipSettled = 1e-3;    // the same: from there on what is left is the multipliers'
+constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are solved
+constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
+constexpr int kMaxDamped = 4;      // models in a row: what friction takes up is known of the last model's bounds alone
+constexpr double kRest = 1e-10;     // of the forces: a model that moves nothing further has found the balance
+constexpr double kSlow = 0.2;      // of the last model's motion: multipliers that leave more, twice running, ...
+constexpr double kStiffer = 30.0;  // ... have springs so much stiffer ...
+constexpr double kLeastReach = 3e-3;  // ... up to this; see SlipScale
+
+class BalanceSearch {
+public:
+    BalanceSearch(ZoneSearch& search, ModelDirection& model) : m_search(search), m_model(model), m_w(search.m_w) {}
+
+    void run() {
+        for (m_search.m_result.iterations = 0;; ++m_search.m_result.iterations) {
+            if (m_search.m_options.interrupt != nullptr) m_search.m_options.interrupt->throw_if_asked();
+            const bool driven = m_search.drives_done();
+            const Accuracy now = look();
+            if (m_search.m_result.iterations >= m_search.m_options.max_iterations)
+                return m_search.fail(ZoneStatus::too_many_iterations);
+            const ModelDirection::Way way = m_model.find(m_w.derivatives.gradient, driven, m_w.y_end);
+            if (!way.found) return m_search.fail(ZoneStatus::no_descent);
+            const double motion = motion_to_end();
+            const double step = m_search.m_path.covered_step(m_w.y_end, way.free);
+            if (!driven) {
+                if (!follow_drives(way, step)) return m_search.fail(ZoneStatus::blocked);
+                continue;
+            }
+            stiffen_multipliers(now, motion);
+            m_search.m_path.set_trial(m_w.y_end, step);
+            if (step == 1.0) m_w.trial.y = m_w.y_end;
+            evaluate(zone(), m_w.trial, &m_w.point);
+            const bool is_first = m_search.m_result.iterations == 0;
+            if (!is_first && step == 1.0 && now.residual < kGoodEnough * m_wanted && motion <= kRest * now.reference)
+                return m_search.accept_trial();
+            if (now.residual > kSettled && rises(step)) continue;
+            m_damped = 0;
+            m_search.accept_trial();
+            m_model.relax();
+        }
+    }
+
+private:
+    const Zone& zone() const { return m_search.m_zone; }
+
+    /// What is left of the balance at the point, and what that asks of the next model.
+    Accuracy look() {
+        differentiate(zone(), m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        m_balance = m_w.derivatives.gradient;
+        m_model.add_friction_forces(m_balance);
+        Accuracy now = m_search.current_accuracy();
+        now.residual = now.reference > 0.0 ? largest_scaled(zone(), m_balance) / now.reference : 0.0;
+        m_search.m_result.residual = now.residual;
+        m_wanted = std::max(m_search.m_options.tolerance, now.floor);
+        const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
+        m_scale.is_settled = now.residual < kSettled;
+        m_model.aim_for({tolerance * now.reference, m_scale, m_scale.is_settled});
+        return now;
+    }
+
+    /// Of the way to y_end.
+    double motion_to_end() {
+        Coordinates& way = m_w.step;
+        way.resize(static_cast<std::size_t>(zone().dynamic_count), zone().nodes.size());
+        const Coordinates& y = m_w.point.y;
+        for (std::size_t i = 0; i < way.bodies.size(); ++i) way.bodies[i] = m_w.y_end.bodies[i] - y.bodies[i];
+        for (std::size_t i = 0; i < way.nodes.size(); ++i) way.nodes[i] = m_w.y_end.nodes[i] - y.nodes[i];
+        return largest_motion(zone(), way);
+    }
+
+    /// False if something is squeezed.
+    bool follow_drives(const ModelDirection::Way& way, double step) {
+        const ZoneSearch::DriveProgress progress = m_search.advance_drives(step, m_stalls);
+        if (progress == ZoneSearch::DriveProgress::moved) m_search.accept_trial();
+        return progress != ZoneSearch::DriveProgress::blocked && !(way.squeezes && step < kSqueeze);
+    }
+
+    /// Where sticking works against other springs multipliers are slow: stiffer ones leave less to them.
+    void stiffen_multipliers(const Accuracy& now, double motion) {
+        m_slow = now.residual < kSlipSettled && motion > kSlow * m_last_motion ? m_slow + 1 : 0;
+        m_last_motion = motion;
+        if (m_slow < 2) return;
+        m_scale.share = std::max(m_scale.share / kStiffer, kLeastReach);
+        m_slow = 0;
+    }
+
+    /// Whether energy and what friction takes up rise; then the model is damped.
+    bool rises(double step) {
+        const double change = m_w.trial.energy - m_w.point.energy + m_model.friction_work(step);
+        if (change <= m_search.current_noise() || m_damped >= kMaxDamped) return false;
+        ++m_damped;
+        m_model.damp(m_w.trial, change);
+        return true;
+    }
+
+    ZoneSearch& m_search;
+    ModelDirection& m_model;
+    ZoneWorkspace& m_w;
+    Coordinates m_balance;  // what is left of it
+    SlipScale m_scale;
+    double m_wanted = 0.0;  // the residual asked for
+    double m_last_motion = kInfinity;
+    int m_stalls = 0, m_slow = 0, m_damped = 0;
+};
+
+}  // namespace
+
+void find_balance(ZoneSearch& search, ModelDirection& model) {
+    BalanceSearch(search, model).run();
+    search.m_w.friction.resize(search.m_w.point.active.size());
+    const std::vector<FrictionState>& states = model.friction();
+    for (std::size_t k = 0; k < search.m_w.friction.size(); ++k)
+        search.m_w.friction[k] = states[static_cast<std::size_t>(search.m_w.point.active[k].index)];
+}
+
+}  // namespace diffsim
