@@ -54,7 +54,8 @@ void add_node_stiffness(const ContactRow& row, double stiffness, BlockSystem& sy
     }
 }
 
-/// What the rows of two bodies do to them together.
+}  // namespace
+
 void add_run(
     const ContactRow& row, const Vector<9>& force, const HalfSymmetric<9>& stiffness, Coordinates& gradient,
     BlockSystem* system) {
@@ -67,8 +68,6 @@ void add_run(
     if (row.b >= 0) system->diagonal(row.b) += blocks.bottomRightCorner<6, 6>();
     if (row.a >= 0 && row.b >= 0) system->off_diagonal(row.pair) += blocks.topRightCorner<6, 6>();
 }
-
-}  // namespace
 
 void add_rows(
     const std::vector<ContactRow>& rows, double share, const std::vector<double>& violation,

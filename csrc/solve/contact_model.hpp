@@ -33,6 +33,11 @@ ModelSolution minimise(
     ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& workspace,
     Coordinates& p);
 
+/// Add what the rows of two bodies do to them together, `row` one of these, to the gradient and, unless it is null, the matrix.
+void add_run(
+    const ContactRow& row, const Vector<9>& force, const HalfSymmetric<9>& stiffness, Coordinates& gradient,
+    BlockSystem* system);
+
 /// Add the rows that push, with this share of their stiffness, to the gradient and, unless it is null, the matrix.
 void add_rows(
     const std::vector<ContactRow>& rows, double share, const std::vector<double>& violation,

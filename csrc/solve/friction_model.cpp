@@ -15,6 +15,7 @@ constexpr double kBoundChange = 0.1;  // of the largest: bounds that change less
 constexpr int kMaxRounds = 10;        // of bounds that stand still
 constexpr int kMaxSearch = 30;        // bisections of a line search
 constexpr double kFlat = 0.1;         // of the slope at the start: that at the end of a step taken in full
+constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
 constexpr double kSettledReach = 0.01;  // of its slip
@@ -40,7 +41,7 @@ public:
         for (int steps = 0;; ++steps) {
             look();
             follow();
-            set_balance();
+            add_all(nullptr);
             const double left = largest_scaled(m_zone, m_w.gradient);
             if (left <= tolerance && m_frozen) {
                 m_frozen = let_bounds_follow() > kBoundChange && ++rounds < kMaxRounds;
@@ -133,28 +134,49 @@ private:
     /// The balance with these forces, and the symmetric matrix for bounds that stay.
     bool factorize() {
         m_system.copy_values(m_model.smooth);
-        m_w.gradient = m_w.smooth_p;
-        add(1.0, m_model.gradient, m_w.gradient);
-        add_rows(m_rows, 1.0, m_w.violation, m_w.pushes, m_w.gradient, &m_system);
-        for (std::size_t f = 0; f < m_friction.size(); ++f) {
-            const FrictionRow& slip = m_friction[f];
-            if (!(m_w.bound[f] > 0.0)) continue;
-            add_friction(slip, m_rows[slip.normal], m_w.pull[f], m_w.gradient);
-            Mat2 stiffness = Mat2::Identity();
-            if (slip.slips) stiffness -= slip.share * slip.share.transpose();
-            stiffness *= m_w.bound[f] / (slip.slips ? std::max(m_w.slip[f].norm(), slip.reach) : slip.reach);
-            add_friction_stiffness(slip, m_rows[slip.normal], stiffness, m_system);
-        }
+        add_all(&m_system);
         return m_system.factorize();
     }
 
-    void set_balance() {
+    /// `system`: null for the balance alone.
+    void add_all(BlockSystem* system) {
         m_w.gradient = m_w.smooth_p;
         add(1.0, m_model.gradient, m_w.gradient);
-        add_rows(m_rows, 1.0, m_w.violation, m_w.pushes, m_w.gradient, nullptr);
-        for (std::size_t f = 0; f < m_friction.size(); ++f)
-            if (m_w.bound[f] > 0.0)
-                add_friction(m_friction[f], m_rows[m_friction[f].normal], m_w.pull[f], m_w.gradient);
+        add_rows(m_rows, 1.0, m_w.violation, m_w.pushes, m_w.gradient, system);
+        std::size_t f = 0;
+        visit_runs(m_rows, [&](std::size_t, std::size_t last) {
+            if (f == m_friction.size() || m_friction[f].normal >= last) return;
+            const ContactRow& row = m_rows[m_friction[f].normal];
+            Vector<9> force = Vector<9>::Zero();  // that rows push with: friction holds back
+            HalfSymmetric<9> stiffness;
+            for (; f < m_friction.size() && m_friction[f].normal < last; ++f)
+                if (m_w.bound[f] > 0.0) add_friction(f, force, stiffness, system);
+            add_run(row, force, stiffness, m_w.gradient, system);
+        });
+    }
+
+    /// One contact's, to the sums of its bodies and to its nodes. Sticking it is as stiff along both tangents, slipping only across its
+    /// slip.
+    void add_friction(std::size_t f, Vector<9>& force, HalfSymmetric<9>& stiffness, BlockSystem* system) {
+        const FrictionRow& slip = m_friction[f];
+        const ContactRow& row = m_rows[slip.normal];
+        const bool has_nodes = !row.nodes.empty();
+        force -= relative_along(slip, m_w.pull[f]);
+        for (std::size_t n = 0; n < row.nodes.size(); ++n)
+            m_w.gradient.nodes[row.nodes[n]] +=
+                slip.node_weights[n] * (m_w.pull[f][0] * slip.tangents[0] + m_w.pull[f][1] * slip.tangents[1]);
+        if (system == nullptr) return;
+        const auto add_along = [&](const Vec2& direction, double k) {
+            stiffness.add_square(k, relative_along(slip, direction));
+            if (has_nodes) add_friction_node_stiffness(slip, row, direction, k, *system);
+        };
+        const double size = m_w.slip[f].norm();
+        if (slip.slips) {
+            add_along({-slip.share[1], slip.share[0]}, m_w.bound[f] / std::max(size, slip.reach));
+        } else {
+            add_along(Vec2::UnitX(), m_w.bound[f] / slip.reach);
+            add_along(Vec2::UnitY(), m_w.bound[f] / slip.reach);
+        }
     }
 
     /// What a motion changes the bounds by, as forces: N x.
@@ -166,7 +188,7 @@ private:
             const FrictionRow& slip = m_friction[f];
             if (!(m_w.bound[f] > 0.0)) continue;
             const double change = slip.coefficient * m_rows[slip.normal].stiffness * m_w.slope[slip.normal];
-            add_friction(slip, m_rows[slip.normal], change * slip.share, result);
+            diffsim::add_friction(slip, m_rows[slip.normal], change * slip.share, result);
         }
         return result;
     }
@@ -190,7 +212,7 @@ private:
     bool bounds_matter() const {
         if (m_frozen) return false;
         for (std::size_t f = 0; f < m_friction.size(); ++f)
-            if (m_w.bound[f] > 0.0 && !m_friction[f].share.isZero(0.0)) return true;
+            if (m_w.bound[f] > 0.0 && m_friction[f].coefficient * m_friction[f].share.norm() > kNegligible) return true;
         return false;
     }
 

@@ -12,7 +12,8 @@ constexpr double kSlipSettled = 1e-3;    // the same: from there on what is left
 constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are solved
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
 constexpr int kMaxDamped = 4;      // models in a row: what friction takes up is known of the last model's bounds alone
-constexpr double kRest = 1e-10;     // of the forces: a model that moves nothing further has found the balance
+constexpr double kRest = 1e-10;    // of the forces: a model that moves nothing further has found the balance
+constexpr int kStandsStill = 6;    // models in balance without halving their motion
 constexpr double kSlow = 0.2;      // of the last model's motion: multipliers that leave more, twice running, ...
 constexpr double kStiffer = 30.0;  // ... have springs so much stiffer ...
 constexpr double kLeastReach = 3e-3;  // ... up to this; see SlipScale
@@ -41,7 +42,8 @@ public:
             if (step == 1.0) m_w.trial.y = m_w.y_end;
             evaluate(zone(), m_w.trial, &m_w.point);
             const bool is_first = m_search.m_result.iterations == 0;
-            if (!is_first && step == 1.0 && now.residual < kGoodEnough * m_wanted && motion <= kRest * now.reference)
+            if (!is_first && step == 1.0 && now.residual < kGoodEnough * m_wanted &&
+                (motion <= kRest * now.reference || stands_still(motion)))
                 return m_search.accept_trial();
             if (now.residual > kSettled && rises(step)) continue;
             m_damped = 0;
@@ -94,6 +96,13 @@ private:
         m_slow = 0;
     }
 
+    /// Rows that nearly depend on each other slip against each other by rounding, which no multiplier ends.
+    bool stands_still(double motion) {
+        m_still = motion > 0.5 * m_least_motion ? m_still + 1 : 0;
+        m_least_motion = std::min(m_least_motion, motion);
+        return m_still >= kStandsStill;
+    }
+
     /// Whether energy and what friction takes up rise; then the model is damped.
     bool rises(double step) {
         const double change = m_w.trial.energy - m_w.point.energy + m_model.friction_work(step);
@@ -110,7 +119,8 @@ private:
     SlipScale m_scale;
     double m_wanted = 0.0;  // the residual asked for
     double m_last_motion = kInfinity;
-    int m_stalls = 0, m_slow = 0, m_damped = 0;
+    double m_least_motion = kInfinity;
+    int m_stalls = 0, m_slow = 0, m_damped = 0, m_still = 0;
 };
 
 }  // namespace

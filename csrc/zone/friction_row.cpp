@@ -1,5 +1,6 @@
 #include "zone/friction_row.hpp"
 
+#include <algorithm>
 #include <type_traits>
 
 #include "math/rotation.hpp"
@@ -117,38 +118,23 @@ void add_friction(const FrictionRow& friction, const ContactRow& row, const Vec2
     for (std::size_t n = 0; n < row.nodes.size(); ++n) sum.nodes[row.nodes[n]] += friction.node_weights[n] * along;
 }
 
-void add_friction_stiffness(
-    const FrictionRow& friction, const ContactRow& row, const Mat2& stiffness, BlockSystem& system) {
-    Eigen::Matrix<double, 9, 2> relative;
-    relative << friction.relative[0], friction.relative[1];
-    if (row.a >= 0 || row.b >= 0) {
-        const Square<12> blocks = both_twists(Square<9>(relative * stiffness * relative.transpose()));
-        if (row.a >= 0) system.diagonal(row.a) += blocks.topLeftCorner<6, 6>();
-        if (row.b >= 0) system.diagonal(row.b) += blocks.bottomRightCorner<6, 6>();
-        if (row.a >= 0 && row.b >= 0) system.off_diagonal(row.pair) += blocks.topRightCorner<6, 6>();
-    }
-    if (row.nodes.empty()) return;
-    Eigen::Matrix<double, 3, 2> tangents;
-    tangents << friction.tangents[0], friction.tangents[1];
-    const Mat3 along = tangents * stiffness * tangents.transpose();
+void add_friction_node_stiffness(
+    const FrictionRow& friction, const ContactRow& row, const Vec2& direction, double stiffness, BlockSystem& system) {
+    const Vec3 along = direction[0] * friction.tangents[0] + direction[1] * friction.tangents[1];
+    const Mat3 square = stiffness * along * along.transpose();
     Mat63 of_body = Mat63::Zero();
-    if (row.a >= 0) {
-        Eigen::Matrix<double, 6, 2> rows;
-        for (int k = 0; k < 2; ++k) rows.col(k) = both_twists(friction.relative[static_cast<std::size_t>(k)]).head<6>();
-        of_body = rows * stiffness * tangents.transpose();
-    }
+    if (row.a >= 0)
+        of_body = both_twists(relative_along(friction, direction)).head<6>() * (stiffness * along).transpose();
     for (std::size_t k = 0; k < row.nodes.size(); ++k) {
         const int node = row.nodes[k];
         if (row.a >= 0) system.mixed_pair(system.find_mixed_pair(row.a, node)) += friction.node_weights[k] * of_body;
         for (std::size_t l = k; l < row.nodes.size(); ++l) {
             const int other = row.nodes[l];
-            const Mat3 block = (friction.node_weights[k] * friction.node_weights[l]) * along;
+            const Mat3 block = (friction.node_weights[k] * friction.node_weights[l]) * square;
             if (node == other)
                 system.node_diagonal(node) += block;
-            else if (node < other)
-                system.node_pair(system.find_node_pair(node, other)) += block;
             else
-                system.node_pair(system.find_node_pair(other, node)) += block;
+                system.node_pair(system.find_node_pair(std::min(node, other), std::max(node, other))) += block;
         }
     }
 }

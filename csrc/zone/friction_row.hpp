@@ -48,8 +48,13 @@ void slips_times(
 /// sum += rows * force
 void add_friction(const FrictionRow& friction, const ContactRow& row, const Vec2& force, Coordinates& sum);
 
-/// system += rows * stiffness * rowsᵀ
-void add_friction_stiffness(
-    const FrictionRow& friction, const ContactRow& row, const Mat2& stiffness, BlockSystem& system);
+/// Of the slip along a direction in the tangent plane, as one row: what its bodies' `relative` is.
+inline Vector<9> relative_along(const FrictionRow& friction, const Vec2& direction) {
+    return direction[0] * friction.relative[0] + direction[1] * friction.relative[1];
+}
+
+/// system += stiffness * that row with itself, as far as nodes take part.
+void add_friction_node_stiffness(
+    const FrictionRow& friction, const ContactRow& row, const Vec2& direction, double stiffness, BlockSystem& system);
 
 }  // namespace diffsim
