@@ -1,9 +1,10 @@
-"""Draw pictures of these documents: `python docs/draw_images.py` writes rows.png and distance.png into docs/images."""
+"""Draw pictures of these documents: `python docs/draw_images.py` writes the drawn ones of docs/images."""
 
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import torch
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -147,6 +148,48 @@ def draw_distance() -> None:
     plt.close(figure)
 
 
+def draw_friction() -> None:
+    """A box on the ground that is pulled harder, then less: what holds it, in the disc and over time, and its speed."""
+    import diffsim as ds
+
+    friction, steps, dt = 0.5, 240, 0.01
+    scene = ds.Scene()
+    scene.add_ground(friction=friction)
+    scene.add_body(ds.shapes.box((0.4, 0.4, 0.1)), mass=1.0, position=(0.0, 0.0, 0.05), friction=friction)
+    sim = ds.Simulator(scene, dt=dt)
+    time = dt * np.arange(steps)
+    pull = 1.5 * friction * 9.81 * np.interp(time, [0.0, 1.2, 2.4], [0.0, 1.0, 0.0])
+    heading = np.interp(time, [0.0, 2.4], [0.0, 1.2])
+    state, held, speed = sim.initial_state(), [], []
+    for force, angle in zip(pull, heading):
+        push = torch.tensor([[force * np.cos(angle), force * np.sin(angle), 0.0]], dtype=torch.float64)
+        contacts = sim.contacts(state, ds.Control(force=push))
+        held.append((contacts.friction.sum(0) / contacts.normal_force.sum(0).norm())[:2].tolist())
+        state = contacts.end
+        speed.append(float(state.velocity.norm()))
+    share = -np.array(held) / friction
+    figure, (disc, axes) = plt.subplots(1, 2, figsize=(7.2, 2.7), width_ratios=(1, 2))
+    turn = np.linspace(0.0, 2.0 * np.pi, 200)
+    disc.fill(np.cos(turn), np.sin(turn), color=FIXED, lw=0)
+    disc.plot(*share.T, color=EXACT, lw=1.8)
+    disc.set(xlim=(-0.25, 1.1), ylim=(-0.25, 1.1), xticks=[0, 1], yticks=[0, 1], aspect="equal")
+    disc.set_xlabel("friction along x / μ normal force", fontsize=8)
+    disc.set_ylabel("along y", fontsize=8)
+    axes.plot(time, pull / (friction * 9.81), color="#888888", lw=1.0, ls=(0, (4, 2)), label="pull / μ m g")
+    axes.plot(time, np.linalg.norm(share, axis=1), color=EXACT, lw=1.8, label="friction / μ normal force")
+    axes.plot(time, speed, color=ROW, lw=1.4, label="speed [m/s]")
+    axes.set_xlabel("time [s]", fontsize=8)
+    axes.legend(fontsize=7, frameon=False)
+    for panel in (disc, axes):
+        panel.tick_params(labelsize=7)
+        for side in ("top", "right"):
+            panel.spines[side].set_visible(False)
+    figure.tight_layout(pad=0.4)
+    figure.savefig(IMAGES / "friction.png", dpi=110)
+    plt.close(figure)
+
+
 if __name__ == "__main__":
     draw_rows()
     draw_distance()
+    draw_friction()
