@@ -9,14 +9,12 @@ namespace {
 
 constexpr double kSettled = 1e-2;        // residual below which contacts mostly go on sticking or slipping
 constexpr double kSlipSettled = 1e-3;    // the same: from there on what is left is the multipliers'
+constexpr double kSettledShare = 3e-3;   // SlipScale::share, then
 constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are solved
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
-constexpr int kMaxDamped = 4;      // models in a row: what friction takes up is known of the last model's bounds alone
-constexpr double kRest = 1e-10;    // of the forces: a model that moves nothing further has found the balance
-constexpr int kStandsStill = 6;    // models in balance without halving their motion
-constexpr double kSlow = 0.2;      // of the last model's motion: multipliers that leave more, twice running, ...
-constexpr double kStiffer = 30.0;  // ... have springs so much stiffer ...
-constexpr double kLeastReach = 3e-3;  // ... up to this; see SlipScale
+constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is known of the last model's bounds alone
+constexpr double kRest = 1e-10;  // of the forces: a model that moves nothing further has found the balance
+constexpr int kStandsStill = 6;  // models in balance without halving their motion
 
 class BalanceSearch {
 public:
@@ -37,7 +35,6 @@ public:
                 if (!follow_drives(way, step)) return m_search.fail(ZoneStatus::blocked);
                 continue;
             }
-            stiffen_multipliers(now, motion);
             m_search.m_path.set_trial(m_w.y_end, step);
             if (step == 1.0) m_w.trial.y = m_w.y_end;
             evaluate(zone(), m_w.trial, &m_w.point);
@@ -66,6 +63,8 @@ private:
         m_wanted = std::max(m_search.m_options.tolerance, now.floor);
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
         m_scale.is_settled = now.residual < kSettled;
+        // Stiffer springs leave less to multipliers, which are slow where sticking works against other contacts' springs.
+        m_scale.share = now.residual < kSlipSettled ? kSettledShare : SlipScale().share;
         m_model.aim_for({tolerance * now.reference, m_scale, m_scale.is_settled});
         return now;
     }
@@ -85,15 +84,6 @@ private:
         const ZoneSearch::DriveProgress progress = m_search.advance_drives(step, m_stalls);
         if (progress == ZoneSearch::DriveProgress::moved) m_search.accept_trial();
         return progress != ZoneSearch::DriveProgress::blocked && !(way.squeezes && step < kSqueeze);
-    }
-
-    /// Where sticking works against other springs multipliers are slow: stiffer ones leave less to them.
-    void stiffen_multipliers(const Accuracy& now, double motion) {
-        m_slow = now.residual < kSlipSettled && motion > kSlow * m_last_motion ? m_slow + 1 : 0;
-        m_last_motion = motion;
-        if (m_slow < 2) return;
-        m_scale.share = std::max(m_scale.share / kStiffer, kLeastReach);
-        m_slow = 0;
     }
 
     /// Rows that nearly depend on each other slip against each other by rounding, which no multiplier ends.
@@ -118,9 +108,8 @@ private:
     Coordinates m_balance;  // what is left of it
     SlipScale m_scale;
     double m_wanted = 0.0;  // the residual asked for
-    double m_last_motion = kInfinity;
     double m_least_motion = kInfinity;
-    int m_stalls = 0, m_slow = 0, m_damped = 0, m_still = 0;
+    int m_stalls = 0, m_damped = 0, m_still = 0;
 };
 
 }  // namespace
