@@ -41,8 +41,9 @@ def stages(packed: PackedScene) -> tuple[list[str], list[str]]:
     nothing_moves = None if has_cloth else none_moves
     stage("ground contact", nothing_moves if packed.has_ground else "no ground")
     stage("body-body contact", none_moves or (None if n > 1 else "one body"))
-    rubbing = np.count_nonzero(packed.friction)
-    stage("friction", nothing_moves or (None if rubbing > 1 else "no two objects with friction"))
+    rubs = packed.friction > 0.0
+    folds = bool(rubs[n : n + len(packed.cloth_names)].any())  # and may touch itself
+    stage("friction", nothing_moves or (None if folds or rubs.sum() > 1 else "no two objects with friction"))
     stage("restitution", "not in this version")
     no_cloth = None if has_cloth else "no cloth"
     stage("cloth", no_cloth)
