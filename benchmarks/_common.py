@@ -247,7 +247,7 @@ def tape_bytes(sim: ds.Simulator, start: ds.State, steps: int) -> int:
     cloth = [getattr(sim, name) for name in CLOTH_PARAMETERS] if start.node_position.numel() else [None] * 5
     with torch.enable_grad():
         first.requires_grad_()
-        rollout(call, *state, *(None,) * 6, sim.mass, sim.inertia, sim.gravity, *cloth)
+        rollout(call, *state, *(None,) * 6, sim.mass, sim.inertia, sim.gravity, sim.friction, *cloth)
     assert isinstance(call.tape, _core.Tape)
     return call.tape.nbytes
 

@@ -1,6 +1,6 @@
 """What a step costs beside its physics: one free body, one step, called from Python.
 
-Timed beside a do-nothing autograd.Function of the same arity (20 tensors in, 6 out; those of cloth are None), in turns,
+Timed beside a do-nothing autograd.Function of the same arity (21 tensors in, 6 out; those of cloth are None), in turns,
 in the same process: forward through `Simulator.__call__` with gradients recorded, and backward to the whole state.
 Prints one CSV line per run; the ratios should be at most 2.
 """
@@ -24,7 +24,7 @@ COLUMNS += ("nothing_backward_us", "step_backward_us", "backward_ratio")
 
 
 class Nothing(torch.autograd.Function):
-    """As `diffsim.ops` has it: an object and 20 tensors (or None) in, 6 tensors (or None) out."""
+    """As `diffsim.ops` has it: an object and 21 tensors (or None) in, 6 tensors (or None) out."""
 
     @staticmethod
     def forward(call: object, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -36,7 +36,7 @@ class Nothing(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return (None, *grads, *(None,) * 14)
+        return (None, *grads, *(None,) * 15)
 
 
 def cases() -> dict[str, Callable[[], object]]:
@@ -46,7 +46,7 @@ def cases() -> dict[str, Callable[[], object]]:
     sim = ds.Simulator(scene, dt=0.01)
     start = sim.initial_state()
     inputs = [t.requires_grad_() for t in (start.position, start.orientation, start.velocity, start.angular_velocity)]
-    arguments = (object(), *inputs, *(None,) * 8, sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
+    arguments = (object(), *inputs, *(None,) * 8, sim.mass, sim.inertia, sim.gravity, sim.friction, *(None,) * 5)
     end = sim(start)
     stepped = (end.position, end.orientation, end.velocity, end.angular_velocity)
     unchanged = Nothing.apply(*arguments)[:4]

@@ -334,11 +334,6 @@ def test_names_are_unique_across_bodies_and_cloths() -> None:
         scene.add_cloth(SHEET, name="")
 
 
-def test_friction_is_announced_as_missing() -> None:
-    with pytest.raises(NotImplementedError, match=r"cloth 'cloth_0': friction=0.3 is not implemented yet"):
-        Scene().add_cloth(SHEET, friction=0.3)
-
-
 # ---- Interpenetration -------------------------------------------------------------------------------------------
 
 

@@ -137,8 +137,10 @@ def test_what_is_wrong_is_still_said() -> None:
     assert not sim.info.converged
     with pytest.raises(ValueError, match="velocity of body 'body_0'"):
         step(state.replace(velocity=state.velocity * float("nan")))
-    with pytest.raises(NotImplementedError, match="friction must be 0"):
-        step(state, parameters={"friction": torch.ones(3, dtype=torch.float64)})
+    with pytest.raises(NotImplementedError, match="restitution must be 0"):
+        step(state, parameters={"restitution": torch.ones(3, dtype=torch.float64)})
+    with pytest.raises(ValueError, match="friction of 'cloth_0'"):
+        step(state, parameters={"friction": torch.tensor([0.5, -1.0, 0.5], dtype=torch.float64)})
     with pytest.raises(Exception, match=r"state.velocity must have shape \(1, 3\)"):
         step(state.replace(velocity=state.velocity[:0]))
 
@@ -160,10 +162,10 @@ def test_the_ops_keep_to_what_torch_asks_of_them() -> None:
     sim = two_bodies()
     state = sim.initial_state()
     inputs = [t.clone().requires_grad_() for t in (state.position, state.orientation, state.velocity)]
-    inputs += [state.angular_velocity, *(None,) * 8, sim.mass, sim.inertia, sim.gravity, *(None,) * 5]
+    inputs += [state.angular_velocity, *(None,) * 8, sim.mass, sim.inertia, sim.gravity, sim.friction, *(None,) * 5]
     settings = (sim._number, 3, False, True, True, False, 0)
     # Without the tests of dispatch: the number of a record is another one each time.
     asked = ("test_schema", "test_autograd_registration", "test_faketensor")
-    arguments = (*settings, *inputs, sim.friction, sim.restitution)
+    arguments = (*settings, *inputs, sim.restitution)
     results = torch.library.opcheck(torch.ops.diffsim.rollout.default, arguments, test_utils=asked)
     assert set(results.values()) == {"SUCCESS"}

@@ -168,7 +168,7 @@ def test_only_what_is_asked_for_is_computed(sim: ds.Simulator, state: ds.State, 
     velocity = state.velocity.clone().requires_grad_()
     end = sim(state.replace(velocity=velocity), ds.Control(force=force))
     end.velocity.sum().backward()
-    assert len(calls.needs) == 20
+    assert len(calls.needs) == 21
     assert [k for k, needed in enumerate(calls.needs) if needed] == [2, 6]  # velocity and force
     assert [g is not None for g in calls.upstream] == [False, False, True, False, False, False]
     assert velocity.grad is not None
@@ -197,14 +197,15 @@ def test_each_gradient_alone_is_what_it_is_among_all(coupling: str) -> None:
     scene.add_body(ds.shapes.box(0.2), kind="kinematic", position=(0.5, 0.5, 0.39), velocity=(0, 0, 0.1))
     scene.add_cloth(ds.shapes.sheet((1.0, 1.0), (4, 4)), ds.ClothMaterial(), pinned=[0], position=(0.5, 0.5, 0.505))
     sim = ds.Simulator(scene, dt=0.01, coupling=coupling)
+    sim.friction.fill_(0.3)
     state = sim.rollout(sim.initial_state(), None, 5)[-1]
     bodies, nodes = torch.zeros_like(state.position), torch.zeros_like(state.node_position)
     control = only_read(sim, ds.Control(bodies + 0.1, bodies - 0.1, nodes + 1e-3, bodies, bodies, nodes))
     sim(state)
     assert sim.info.contacts > 4
     paths, _ = pytree.tree_flatten_with_path((dict(sim.named_parameters()), state, control))
-    names = {pytree.keystr(path) for path, _ in paths} - {"[0]['friction']", "[0]['restitution']"}
-    assert len(names) == 20
+    names = {pytree.keystr(path) for path, _ in paths} - {"[0]['restitution']"}
+    assert len(names) == 21
     together = gradients(sim, state, control, names)
     assert together.keys() == names
     for name in names:

@@ -102,6 +102,7 @@ def test_wrong_parameters_of_a_call_are_named(check: bool) -> None:
         ({"friction": one}, ValueError, "parameters['friction'] must have shape (2,) or (B, 2), got (1,)"),
         ({"cloth_bend": one}, ValueError, "parameters['cloth_bend'] must have shape (0,) or (B, 0), got (1,)"),
         ({"mass": -one}, ValueError, "mass"),
+        ({"friction": -one.expand(3, 2)}, ValueError, "friction of 'body_0' (index 0) must be zero or positive"),
     ]
     for parameters, error, text in cases:
         with pytest.raises(error) as stepped:
@@ -111,5 +112,5 @@ def test_wrong_parameters_of_a_call_are_named(check: bool) -> None:
         assert text in str(stepped.value)
         assert text in str(rolled.value)
     if check:
-        with pytest.raises(NotImplementedError, match="friction must be 0"):
-            sim(state, parameters={"friction": 0.5 * torch.ones(3, 2).double()})
+        with pytest.raises(NotImplementedError, match="restitution must be 0"):
+            sim(state, parameters={"restitution": 0.5 * torch.ones(3, 2).double()})

@@ -227,7 +227,7 @@ def test_a_state_of_ours_in_the_ground_is_held_and_told() -> None:
     position = state.position.clone()
     position[0, 2] = 0.25 - 1e-3
     tensors = (position, state.orientation, state.velocity, state.angular_velocity, *(None,) * 8)
-    parameters = (sim.mass, sim.inertia, sim.gravity, *(None,) * 5)
+    parameters = (sim.mass, sim.inertia, sim.gravity, sim.friction, *(None,) * 5)
     with pytest.raises(ValueError, match="penetrate"):
         rollout(RolloutCall(sim._model, sim._options, 2, 1), *tensors, *parameters)
     call = RolloutCall(sim._model, sim._options, 2, 1, first_step=4)

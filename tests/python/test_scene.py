@@ -401,9 +401,9 @@ BAD_VALUES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"kind": 1}, ValueError, "kind must be one of"),
     ({"kind": "static", "velocity": (1, 0, 0)}, ValueError, "velocity must be zero for a static body.*'kinematic'"),
     ({"kind": "static", "density": -1.0}, ValueError, "density must be positive"),
-    ({"friction": 0.5}, NotImplementedError, "friction=0.5 is not implemented yet: contact is frictionless"),
     ({"friction": -0.5}, ValueError, "friction must not be negative"),
     ({"friction": NAN}, ValueError, "friction must be finite"),
+    ({"friction": INF}, ValueError, "friction must be finite"),
     ({"restitution": 0.5}, NotImplementedError, "restitution=0.5 is not implemented yet"),
     ({"restitution": 1.5}, ValueError, "restitution must lie between 0 and 1"),
 ]
@@ -457,8 +457,8 @@ def test_bad_gravity_ground_and_thickness() -> None:
         scene.add_ground(height=INF)
     with pytest.raises(ValueError, match="ground: margin must be positive"):
         scene.add_ground(margin=-1.0)
-    with pytest.raises(NotImplementedError, match=r"ground: friction=0\.3 is not implemented yet"):
-        scene.add_ground(friction=0.3)
+    with pytest.raises(ValueError, match=r"ground: friction must not be negative, got -0\.3"):
+        scene.add_ground(friction=-0.3)
     scene.add_ground(height=1.5)
     with pytest.raises(ValueError, match=re.escape("already has a ground, at height 1.5 m")):
         scene.add_ground()
