@@ -3,13 +3,15 @@
     python tests/fuzz.py --scenes 200 --steps 300 --seed 0
     python tests/fuzz.py --scenes 40 --steps 100 --bodies 4 --cloths 1 --gradients 20
     python tests/fuzz.py --regular --scenes 200 --steps 60 --gradients 20
+    python tests/fuzz.py --friction --scenes 60 --steps 200 --gradients 20
 
 Each scene has ten bodies, convex and not, that fall on each other, every second time between four walls; with --cloths
 sheets of random material among them, some of them pinned. With --regular they are those of tests/python/regular_scenes
 instead: stacks, walls, rows, with edges parallel and corners above corners. With --gradients k the gradient of every
 k-th step is held against differences: it is wrong if it agrees with those of no step size. Scene k of seed S is the
-same whatever the number of scenes: `--first k --scenes 1` runs it alone. With --failures the state before each step
-that does not converge is written there.
+same whatever the number of scenes: `--first k --scenes 1` runs it alone. With --friction all objects of the same scenes
+have a coefficient between 0 and 1.5, and energy must not rise, but by what forces and moving bodies do. With --failures
+the state before each step that does not converge is written there.
 """
 
 from __future__ import annotations
@@ -39,6 +41,8 @@ WALL = 0.1  # [m]
 DIFFERENCES = (1e-6, 1e-5, 3e-6, 3e-7, 1e-7, 3e-8, 1e-8)  # step sizes of central differences
 WRONG = 1e-4  # relative error of a derivative; differences have up to a hundredth of that of their own
 SLOW = 200.0  # of a scene's median step
+MOST_FRICTION = 1.5
+RISE = 1e-3  # of energy in a step, relative to what there is of kinetic energy and fell in it
 
 
 @dataclass(frozen=True)
@@ -171,10 +175,34 @@ def save(state: ds.State, directory: Path, name: str) -> None:
     (directory / f"{name}.json").write_text(json.dumps(fields))
 
 
-def run_scene(scene: ds.Scene, index: int, steps: int, every: int, failures: Path | None, regular: bool) -> Outcome:
-    """`every`: steps from one that is held against differences to the next; 0 for none."""
+def rises_of_energy(sim: ds.Simulator, frames: list[ds.State], force: torch.Tensor) -> list[str]:
+    """Steps in which it rose by more than the force did. Nothing is said where bodies move as told."""
+    if bool((sim._packed.kind == 2).any()):
+        return []
+    path = ds.State.stack([frame.detach() for frame in frames])
+    kinetic = sim.kinetic_energy(path)
+    energy = kinetic + sim.potential_energy(path)
+    work = (force.detach() * path.position.diff(dim=0)).sum(dim=(1, 2))
+    rise = energy.diff() - work
+    fall = DT * (sim.mass * path.velocity.norm(dim=-1)).sum(dim=-1) * sim.gravity.norm()
+    size = (kinetic + fall)[:-1] + (kinetic + fall)[1:]
+    return [
+        f"energy rose by {rise[k]:.2g} J of {size[k]:.2g} J in step {k + 1}"
+        for k in (rise > RISE * size + 1e-9).nonzero().flatten().tolist()
+    ]
+
+
+def run_scene(
+    scene: ds.Scene, index: int, steps: int, every: int, failures: Path | None, regular: bool, friction: int | None
+) -> Outcome:
+    """`every`: steps from one that is held against differences to the next; 0 for none. `friction`: seed of the
+    coefficients.
+    """
     start = time.perf_counter()
     sim = ds.Simulator(scene, DT)
+    if friction is not None:
+        rng = np.random.default_rng([friction, index, 1])
+        sim.friction.copy_(torch.from_numpy(rng.uniform(0.0, MOST_FRICTION, size=sim.friction.shape)))
     generator = torch.Generator().manual_seed(index)
     state = sim.initial_state()
     cloths = state.node_position.numel() > 0
@@ -196,6 +224,8 @@ def run_scene(scene: ds.Scene, index: int, steps: int, every: int, failures: Pat
         fields += ["node_position", "node_velocity"]
         leaves |= {"node_position": state.node_position, "node_velocity": state.node_velocity}
         leaves |= {name: getattr(sim, name) for name in ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend")}
+    if friction is not None:
+        leaves["friction"] = sim.friction
     for leaf in leaves.values():
         leaf.requires_grad_()
     control = ds.Control(force=force)
@@ -227,6 +257,8 @@ def run_scene(scene: ds.Scene, index: int, steps: int, every: int, failures: Pat
     for name in fields:
         if not bool(getattr(end, name).isfinite().all()):
             problems.append(f"{name} is not finite")
+    if friction is not None:
+        problems += rises_of_energy(sim, frames, force)
     slowest = max(times) / statistics.median(times)
     largest = max(float(g.abs().max()) for g in gradients.values())
 
@@ -258,6 +290,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="index of the first scene")
     parser.add_argument("--regular", action="store_true", help="scenes in which everything is aligned")
+    parser.add_argument("--friction", action="store_true", help="between all objects, at random")
     parser.add_argument("--failures", type=Path, help="directory for the states before steps that do not converge")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", ds.ConvergenceWarning)  # they are counted instead
@@ -267,7 +300,15 @@ def main() -> int:
             scene = regular_scene(arguments.seed, index)
         else:
             scene = random_scene(arguments.seed, index, arguments.bodies, arguments.cloths)
-        outcome = run_scene(scene, index, arguments.steps, arguments.gradients, arguments.failures, arguments.regular)
+        outcome = run_scene(
+            scene,
+            index,
+            arguments.steps,
+            arguments.gradients,
+            arguments.failures,
+            arguments.regular,
+            arguments.seed if arguments.friction else None,
+        )
         derivatives += outcome.derivatives
         bad += bool(outcome.problems)
         failed += outcome.failed_steps

@@ -28,6 +28,7 @@ def wrong_derivatives(sim: ds.Simulator, state: ds.State, control: ds.Control, s
         end = sim(
             state.replace(**{name: value for name, value in values.items() if hasattr(state, name)}),
             control.replace(force=values["force"]),
+            parameters={name: values[name] for name in ("friction",) if name in values},
         )
         total = torch.zeros((), dtype=torch.float64)
         for name in inputs:
@@ -86,12 +87,16 @@ def _inputs(sim: ds.Simulator, state: ds.State, control: ds.Control) -> dict[str
         names += ["node_position", "node_velocity"]
     inputs = {name: getattr(state, name).detach() for name in names}
     inputs["force"] = torch.zeros_like(state.velocity) if control.force is None else control.force.detach()
+    if bool(sim.friction.any()):
+        inputs["friction"] = sim.friction.detach()
     return inputs
 
 
 def _direction(name: str, value: torch.Tensor, sim: ds.Simulator, generator: torch.Generator) -> torch.Tensor:
     """A force as an acceleration, a quaternion's change as a turn."""
     direction = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+    if name == "friction":
+        return value * direction  # what has none is not moved below zero
     if name == "force":
         return direction * sim.mass.detach()[:, None]
     if name == "orientation":
