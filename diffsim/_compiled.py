@@ -110,9 +110,7 @@ def rollout(
 
 # By hand and not by torch.library.custom_op: what that makes of a derivative cannot be called inside torch.func.
 _library = torch.library.Library("diffsim", "DEF")
-_library.define(
-    f"rollout({_SETTINGS}, {_INPUTS}, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})"
-)
+_library.define(f"rollout({_SETTINGS}, {_INPUTS}, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})")
 _library.define(f"rollout_backward({_SETTINGS}, bool[] needs, Tensor tape, {_INPUTS}, {_GRADS}) -> Tensor[]")
 
 
