@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,6 +111,29 @@ def inertial(model: Any, root: int) -> Inertial:
         arm = c - center
         about += own + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return Inertial(mass, center, about)
+
+
+# ---- friction --------------------------------------------------------------------------------------------------------
+
+
+def sliding_friction(model: Any, geom: int) -> float:
+    """Coulomb's coefficient, 0 without tangential directions (condim 1)."""
+    return float(model.geom_friction[geom, 0]) if model.geom_condim[geom] > 1 else 0.0
+
+
+def friction_of(model: Any, geoms: Sequence[int]) -> float:
+    """Of a body with these geoms: it has one coefficient, so the largest, as MuJoCo takes the larger of two."""
+    return max(sliding_friction(model, geom) for geom in geoms)
+
+
+def differences_of_friction(model: Any, geoms: list[int]) -> list[str]:
+    """What MuJoCo makes of the friction of these geoms and a scene does not, in words."""
+    found = []
+    if len({sliding_friction(model, geom) for geom in geoms}) > 1:
+        found.append("of two coefficients that differ MuJoCo takes the larger, here their geometric mean acts")
+    if any(model.geom_condim[geom] > 3 for geom in geoms):
+        found.append("torsional and rolling friction (condim 4 and 6) are left out")
+    return found
 
 
 # ---- overlaps --------------------------------------------------------------------------------------------------------

@@ -12,8 +12,9 @@ velocity               of the body frame's origin, world        of the centre of
 angular velocity       in the axes of the body                  in the axes of the world
 =====================  =======================================  =============================================
 
-Contact differs too: MuJoCo's is soft and has friction, and it takes a mesh for its convex hull; here it is stiff and a
-mesh is what it is.
+Contact differs too: MuJoCo's is soft and creeps under friction, and it takes a mesh for its convex hull; here it is
+stiff, what friction holds stays, and a mesh is what it is. Of two objects that differ MuJoCo takes the larger
+coefficient of friction, and here their geometric mean acts: between equal ones it is the same.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ def load(source: str | os.PathLike[str] | mujoco.MjModel) -> Scene:
     ground. A plane that is not horizontal becomes a rectangle of its size. Spheres and capsules are exact, if they are
     all their body has to collide with; cylinders become prisms of 32 sides and ellipsoids (and round geoms beside
     others) meshes, all with their corners on the true surface. Meshes are taken as they are, not as their hulls. Mass,
-    centre of mass and inertia are MuJoCo's, whatever the mesh. Geoms with contype and conaffinity 0 are left out.
+    centre of mass and inertia are MuJoCo's, whatever the mesh. Friction is a geom's sliding coefficient, 0 with condim
+    1, and of a body of several the largest. Geoms with contype and conaffinity 0 are left out.
 
     MuJoCo's time step is not part of a scene: ``ds.Simulator(scene, dt=model.opt.timestep)``.
 
@@ -67,7 +69,7 @@ def load(source: str | os.PathLike[str] | mujoco.MjModel) -> Scene:
             filters and media, by name.
         ValueError: A free or mocap body without a geom to collide with; a plane that is neither horizontal nor of
             finite size; what MuJoCo says of a file it cannot read, and what `Scene.add_body` says.
-    Warns: UserWarning, once, of friction: contact is frictionless, unless all geoms already have condim 1.
+    Warns: UserWarning, once, where friction is another than MuJoCo's: coefficients that differ, condim 4 and 6.
     """
     model = _compiled(source)
     _mjcf.refuse_what_is_left(model)
@@ -80,12 +82,8 @@ def load(source: str | os.PathLike[str] | mujoco.MjModel) -> Scene:
             _add_static(scene, model, group)
         else:
             _add_moving(scene, model, group)
-    if any(model.geom_condim[geom] > 1 for geom in geoms):
-        warnings.warn(
-            "mujoco.load: contact is frictionless, so the friction of the model's geoms is left out; condim=1 is the"
-            " same in MuJoCo",
-            stacklevel=2,
-        )
+    if differences := _mjcf.differences_of_friction(model, geoms):
+        warnings.warn(f"mujoco.load: friction is not quite MuJoCo's: {'; '.join(differences)}", stacklevel=2)
     return scene
 
 
@@ -186,7 +184,7 @@ def _add_moving(scene: Scene, model: Any, group: Group) -> None:
         properties = replace(properties, center=np.zeros(3))
     shape = _moving_shape(model, group, properties, where)
     position, orientation = _mjcf.pose_in(model, 0, group.root)
-    _add(scene, name, group, shape, position, orientation)
+    _add(scene, name, group, shape, position, orientation, _mjcf.friction_of(model, group.geoms))
 
 
 def _moving_shape(model: Any, group: Group, properties: Inertial, where: str) -> Shape:
@@ -216,14 +214,15 @@ def _round_shape(model: Any, geom: int, kind: Kind, mass: Any, inertia: Any, whe
 
 
 def _add_static(scene: Scene, model: Any, group: Group) -> None:
-    ground: float | None = None
+    planes: list[tuple[float, float]] = []  # heights and coefficients of friction
     for geom in group.geoms:
         name = _mjcf.geom_name(model, geom)
         where = f"body {name!r}"
         position, orientation = _mjcf.geom_pose(model, 0, geom)
+        friction = _mjcf.sliding_friction(model, geom)
         if model.geom_type[geom] == _mjcf.PLANE:
             if rotation_matrix(orientation)[2, 2] > 1.0 - 1e-12:
-                ground = position[2] if ground is None else max(ground, position[2])
+                planes.append((float(position[2]), friction))
                 continue
             if not model.geom_size[geom, :2].all():
                 raise ValueError(
@@ -234,15 +233,24 @@ def _add_static(scene: Scene, model: Any, group: Group) -> None:
         else:
             vertices, faces = read_mesh(_mjcf.surface(model, geom), where)
             shape = mesh_shape(vertices, faces, None, None, None, "static", None, where)
-        _add(scene, name, group, replace(shape, center=np.zeros(3)), position, orientation)
-    if ground is not None:
-        scene.add_ground(height=float(ground))
+        _add(scene, name, group, replace(shape, center=np.zeros(3)), position, orientation, friction)
+    if planes:
+        height, friction = max(planes)
+        scene.add_ground(height=height, friction=friction)
 
 
-def _add(scene: Scene, name: str, group: Group, shape: Shape, position: FloatArray, orientation: FloatArray) -> None:
+def _add(
+    scene: Scene,
+    name: str,
+    group: Group,
+    shape: Shape,
+    position: FloatArray,
+    orientation: FloatArray,
+    friction: float,
+) -> None:
     where, name = scene._name(name, "body", 0)
     motion = (position, orientation, np.zeros(3), np.zeros(3))
-    scene._add(name, where, group.kind, shape, motion, 0.0, 0.0, "MuJoCo's lengths are taken for metres")
+    scene._add(name, where, group.kind, shape, motion, friction, 0.0, "MuJoCo's lengths are taken for metres")
 
 
 # ---- states ----------------------------------------------------------------------------------------------------------

@@ -239,14 +239,38 @@ def test_bodies_without_a_surface_and_planes_without_end_are_refused() -> None:
         ds.interop.mujoco.load(one('<geom name="ramp" type="plane" size="0 0 1" euler="0 30 0"/>'))
 
 
-def test_friction_is_left_out_with_one_warning() -> None:
-    with pytest.warns(UserWarning, match="friction of the model's geoms is left out") as caught:
-        ds.interop.mujoco.load(SCENE)
-    assert len(caught) == 1
-    assert caught[0].filename == __file__
+SLOPE = """<mujoco><option timestep="0.01" gravity="3.0 0 -9.0" cone="elliptic" impratio="100"/><worldbody>
+<geom type="plane" size="0 0 1" friction="0.2"/>
+<body name="b" pos="0 0 0.101"><freejoint/><geom type="box" size=".2 .2 .1" friction="0.2"/></body>
+</worldbody></mujoco>"""
+
+
+def test_friction_is_mujocos_between_equal_coefficients() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        ds.interop.mujoco.load(one(free(BOX)))
+        sim = ds.Simulator(ds.interop.mujoco.load(SLOPE), dt=0.01)
+    model = mujoco.MjModel.from_xml_string(SLOPE)
+    data = mujoco.MjData(model)
+    state = sim.rollout(sim.initial_state(), steps=50)[-1]
+    mujoco.mj_step(model, data, 50)
+    assert sim.friction.tolist() == pytest.approx([0.2, 0.2])
+    assert state.velocity[0, 0].item() == pytest.approx(0.5 * (3.0 - 0.2 * 9.0), abs=0.01)
+    assert data.qvel[0] == pytest.approx(state.velocity[0, 0].item(), rel=0.05)  # it has a contact's softness to go
+
+
+def test_friction_that_differs_from_mujocos_is_warned_of_once() -> None:
+    both = one(free('<geom type="box" size=".1 .2 .3" friction="0.5"/><geom type="sphere" size=".1" friction="0.7"/>'))
+    with pytest.warns(UserWarning, match="takes the larger, here their geometric mean acts") as caught:
+        scene = ds.interop.mujoco.load(both)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    np.testing.assert_array_equal(scene.pack().friction, [0.7])
+    with pytest.warns(UserWarning, match=r"torsional and rolling friction \(condim 4 and 6\) are left out"):
+        ds.interop.mujoco.load(one(free(BOX.replace('condim="1"', 'condim="4"'))))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(ds.interop.mujoco.load(SCENE).pack().friction, 1.0)  # MuJoCo's default
+        np.testing.assert_array_equal(ds.interop.mujoco.load(one(free(BOX))).pack().friction, 0.0)
 
 
 def test_files_are_read(tmp_path: Any) -> None:
