@@ -24,6 +24,7 @@ COLUMNS = {
     "contact_rich": ("scene", "forward_ms", "longest_ms", "failed_steps", "forward_to_mujoco", "longest_to_resting"),
     "falling_cubes": ("cubes", "forward_s", "mujoco_elliptic_s", "memory_mb", "rest_gap_m"),
     "fast_differentiation": ("cubes", "mode", "backward_ms", "memory_mb", "error", "backward_to_mujoco"),
+    "friction": ("name", "creep", "acceleration_error", "gradient_error", "gradient_ms"),
     "limits": ("case", "name", "state", "what", "energy_made", "distance", "iterations", "error", "failed_steps"),
     "local_collisions": ("cubes", "step", "mode", "local_ms", "global_ms", "lcp_published_ms", "paper_code_ms"),
     "many_objects": ("objects", "forward_backward_s", "mujoco_forward_s", "memory_mb", "mpm_s", "paper_code_s"),
