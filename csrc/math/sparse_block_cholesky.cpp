@@ -11,8 +11,6 @@
 namespace diffsim {
 namespace {
 
-constexpr int kTile = kCholeskyTile;
-
 template <int kRows, int kColumns>
 void copy_block(const double* from, double* to, std::ptrdiff_t stride) {
     for (int c = 0; c < kColumns; ++c)
@@ -211,7 +209,7 @@ void SparseBlockCholesky::reserve_storage() {
     for (int parity = 0; parity < 2; ++parity) m_stacks[parity].reserve(highest[parity]);
     m_solution.reserve(static_cast<std::size_t>(m_row_count));
     m_front_x.reserve(front_rows);
-    m_partials.reserve(kTile * width);
+    m_partials.reserve(kCholeskyTile * width);
     m_reached.assign(m_supernodes.size(), 0);
 }
 
@@ -358,7 +356,7 @@ void SparseBlockCholesky::solve_in_place(double* x) const {
         const int width = node.padded_width, rows = width + node.padded_below;
         std::copy_n(y + node.first, node.width, z);
         std::fill(z + node.width, z + width, 0.0);
-        std::fill(z + rows - std::min(kTile, node.padded_below), z + rows, 0.0);
+        std::fill(z + rows - std::min(kCholeskyTile, node.padded_below), z + rows, 0.0);
         for (int k = node.solve_run_begin; k < node.solve_run_end; ++k) {
             const Run& run = m_solve_runs[k];
             std::copy_n(y + run.from, run.count, z + width + run.to);

@@ -16,7 +16,7 @@ constexpr int kMaxListings = 8;     // for a way that leads out of the list it w
 constexpr int kMaxRounds = 2;       // of linearising again where a way ends
 constexpr double kMaxTurn = 0.5;    // [rad] of a fast body in one way
 constexpr int kMaxFastRounds = 10;  // where bodies move so fast for their size that they could pass each other
-constexpr int kMaxHalvings = 6;     // of the way of bodies that something still stops
+constexpr int kMaxShortenings = 6;  // of the way of bodies that something still stops
 constexpr double kCrawling = 0.2;   // of a Newton step: rows are not followed so
 constexpr std::array<double, 3> kStages = {1e-2, 1e-1, 1.0};  // of the rows' stiffness
 constexpr double kProximal = 1.0;                             // of the inertia: the first damping of a body
@@ -439,7 +439,7 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
     std::vector<Impact> impacts;
     way.free = allowed_step(m_zone, m_point, y_end, &impacts);
     Coordinates aim = p, best = y_end;
-    for (int halvings = 0; way.free < 1.0 && halvings <= kMaxHalvings; ++halvings) {
+    for (int halvings = 0; way.free < 1.0 && halvings <= kMaxShortenings; ++halvings) {
         if (halvings > 0) {
             // The shortened way, moved by the rows as little as possible in the metric of the model.
             shorten_blocked(impacts, aim);

@@ -10,7 +10,7 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxRounds = 100;
+constexpr int kMaxMoves = 100;
 constexpr double kClearance = 1e-3;      // of the contact's depth: what to aim at beyond the rest distance
 constexpr double kAccepted = 1e-9;       // of the contact's depth: how far below the rest distance is good enough
 constexpr double kWellDefined = 0.02;    // of the contact's depth: nearer than this a normal may be rounding noise
@@ -107,7 +107,7 @@ public:
     }
 
     Separation run() {
-        for (int round = 0; round < kMaxRounds; ++round) {
+        for (int round = 0; round < kMaxMoves; ++round) {
             list_rows(round >= kRoundsBeforeGuesses);
             if (m_result.complete) break;
             set_metric();

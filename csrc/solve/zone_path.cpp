@@ -9,7 +9,7 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxHalvings = 50;
+constexpr int kMaxCuts = 50;
 constexpr double kBeforeImpact = 1.0 - 1e-6;  // of the way to an impact: there rounding finds it once more
 constexpr double kArcPart = 0.9;              // of an arc whose chord is not clear
 
@@ -88,7 +88,7 @@ void ZonePath::set_trial(const Coordinates& y_end, double step) {
 double ZonePath::clear_step(const Coordinates& y_end, Clearance clearance) {
     double step = 1.0;
     m_trial.y = y_end;
-    for (int k = 0; k < kMaxHalvings; ++k) {
+    for (int k = 0; k < kMaxCuts; ++k) {
         const double allowed = allowed_step(m_zone, m_point, m_trial.y, nullptr, clearance);
         if (allowed == 1.0 && gates_hold(m_trial.y)) {
             evaluate(m_zone, m_trial, &m_point);
@@ -101,7 +101,7 @@ double ZonePath::clear_step(const Coordinates& y_end, Clearance clearance) {
 }
 
 double ZonePath::arc_step(const Coordinates& y_end, double step) {
-    for (int k = 0; k < kMaxHalvings && step > 0.0; ++k) {
+    for (int k = 0; k < kMaxCuts && step > 0.0; ++k) {
         m_trial.y = y_end;
         if (step < 1.0) set_trial(y_end, step);
         const double allowed = allowed_step(m_zone, m_point, m_trial.y, nullptr);

@@ -14,9 +14,7 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxBlocked = 2;     // shortenings of a blocked drive before it is stopped
-constexpr int kWorthSharing = 64;  // bodies and nodes to be solved for: fewer are done before a thread has woken up
-constexpr int kPortionsPerThread = 32;  // of the groups: they take differently long
+constexpr int kMaxBlocked = 2;  // shortenings of a blocked drive before it is stopped
 
 using Clock = std::chrono::steady_clock;
 

@@ -8,12 +8,6 @@
 #include "step/thread_memory.hpp"
 
 namespace diffsim {
-namespace {
-
-constexpr int kWorthSharing = 64;       // bodies and nodes in zones: fewer are done before a thread has woken up
-constexpr int kPortionsPerThread = 32;  // of the zones: they take differently long
-
-}  // namespace
 
 struct StepWorkspace::BackwardScratch {
     std::vector<Vec6> pose_gradient;   ///< along the twist of the body at the end of the step

@@ -5,8 +5,11 @@
 #include "adjoint/adjoint.hpp"
 #include "step/step.hpp"
 
-/// What each thread of a step keeps to itself.
+/// What each thread of a step keeps to itself, and when there is work for more than one.
 namespace diffsim {
+
+inline constexpr int kWorthSharing = 64;  ///< bodies and nodes of zones: fewer are done before a thread has woken up
+inline constexpr int kPortionsPerThread = 32;  ///< of the zones: they take differently long
 
 /// A kinematic body that did not reach its target.
 struct BlockedDrive {
