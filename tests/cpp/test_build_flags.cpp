@@ -3,6 +3,8 @@
 
 #include <vector>
 
+namespace test_build_flags {
+
 TEST(eigen_sums_have_the_same_bits_at_any_alignment) {
     constexpr int kSize = 37;
     const Eigen::VectorXd values = check::Random(1).vector(kSize);
@@ -15,3 +17,5 @@ TEST(eigen_sums_have_the_same_bits_at_any_alignment) {
         CHECK(argument.sum() == values.sum());
     }
 }
+
+}  // namespace test_build_flags

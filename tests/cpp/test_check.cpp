@@ -3,6 +3,8 @@
 
 #include <limits>
 
+namespace test_check {
+
 namespace {
 
 enum class Colour { red, green };
@@ -96,3 +98,5 @@ TEST(random_numbers_are_seeded_and_in_range) {
     CHECK(a.maxCoeff() < 3.0);
     CHECK_NEAR(a.mean(), 2.5, 0.05);  // five standard errors, 5 / sqrt(12 · 1000)
 }
+
+}  // namespace test_check

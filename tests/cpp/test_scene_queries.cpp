@@ -5,6 +5,8 @@
 #include "cloth_fixtures.hpp"
 #include "zone/zone_contacts.hpp"
 
+namespace test_scene_queries {
+
 using namespace diffsim;
 using fixtures::random_rotation;
 using fixtures::random_vec3;
@@ -302,3 +304,5 @@ TEST(separation_leaves_what_is_apart_alone) {
     const SceneState moved = scene.separated();
     for (int i = 0; i < 2; ++i) CHECK(moved.bodies[i].position == scene.state.bodies[i].position);
 }
+
+}  // namespace test_scene_queries

@@ -6,6 +6,8 @@
 #include "cloth_fixtures.hpp"
 #include "solve/zone_solver.hpp"
 
+namespace test_adjoint {
+
 using namespace diffsim;
 using fixtures::dense;
 using fixtures::flatten;
@@ -482,3 +484,5 @@ TEST(modes_differ_where_contacts_turn) {
     const VectorX linear = multiplier(zone, point, upstream, AdjointMode::dense);
     CHECK((exact - linear).norm() > 1e-4 * exact.norm());
 }
+
+}  // namespace test_adjoint

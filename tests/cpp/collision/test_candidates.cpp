@@ -8,6 +8,8 @@
 #include "geometry/distance.hpp"
 #include "sweep_fixtures.hpp"
 
+namespace test_candidates {
+
 using namespace diffsim;
 using fixtures::DeformingSweep;
 using fixtures::random_rotation;
@@ -345,3 +347,5 @@ TEST(nodes_below_a_height_are_those_of_brute_force) {
     }
     CHECK(cases_hit >= 30);
 }
+
+}  // namespace test_candidates

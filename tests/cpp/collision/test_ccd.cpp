@@ -4,6 +4,8 @@
 
 #include "ccd_fixtures.hpp"
 
+namespace test_ccd {
+
 using namespace diffsim;
 using fixtures::Motion;
 using fixtures::random_polygon;
@@ -221,3 +223,5 @@ TEST(random_motions_are_safe_up_to_the_impact_and_close_at_it) {
     CHECK(impacts >= 50);
     CHECK(misses >= 50);
 }
+
+}  // namespace test_ccd

@@ -6,6 +6,8 @@
 
 #include "ccd_fixtures.hpp"
 
+namespace test_ccd_cost {
+
 using namespace diffsim;
 using fixtures::Motion;
 using fixtures::random_direction;
@@ -268,3 +270,5 @@ TEST(bodies_of_a_micrometre_take_few_advances) {
     }
     CHECK(impacts >= 100);
 }
+
+}  // namespace test_ccd_cost

@@ -1,6 +1,8 @@
 #include "collision/candidates.hpp"
 #include "sweep_fixtures.hpp"
 
+namespace test_crossing {
+
 using namespace diffsim;
 using fixtures::DeformingSweep;
 using fixtures::random_rotation;
@@ -140,3 +142,5 @@ TEST(triangles_with_one_common_node_can_cross) {
     swept.begin[4] = Vec3(0.5, 0.25, -0.3);
     CHECK(crosses_itself(swept.swept()));
 }
+
+}  // namespace test_crossing

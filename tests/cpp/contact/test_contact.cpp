@@ -7,6 +7,8 @@
 #include "collision/ccd.hpp"
 #include "fixtures.hpp"
 
+namespace test_contact {
+
 using namespace diffsim;
 using fixtures::random_rotation;
 using fixtures::random_vec3;
@@ -403,3 +405,5 @@ TEST(contact_toi_stops_every_type_at_its_floor) {
     CHECK(toi <= 1.55 / 4.0);
     CHECK(toi >= 1.55 / 4.0 - options.tolerance);
 }
+
+}  // namespace test_contact

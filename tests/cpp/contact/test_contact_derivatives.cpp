@@ -8,6 +8,8 @@
 #include "cloth_fixtures.hpp"
 #include "collision/ccd.hpp"
 
+namespace test_contact_derivatives {
+
 using namespace diffsim;
 using fixtures::random_rotation;
 using fixtures::random_vec3;
@@ -297,3 +299,5 @@ TEST(contact_toi_with_cloth_stops_every_type_at_its_floor) {
     }
     for (const int cases : cases_hit) CHECK(cases >= 5);
 }
+
+}  // namespace test_contact_derivatives

@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_law {
+
 using namespace diffsim;
 
 namespace {
@@ -98,3 +100,5 @@ TEST(the_normal_force_counts_from_the_rest_distance_to_the_pole) {
         CHECK_NEAR(normal_force(law, before.rest).force, 7.0, 1e-10);
     }
 }
+
+}  // namespace test_law

@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_potential {
+
 using namespace diffsim;
 
 namespace {
@@ -73,3 +75,5 @@ TEST(mollifier_agrees_with_differences_and_joins_smoothly) {
     CHECK(above.value == 1.0);
     CHECK(above.first == 0.0);
 }
+
+}  // namespace test_potential

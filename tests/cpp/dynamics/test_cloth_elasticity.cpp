@@ -4,6 +4,8 @@
 
 #include "elasticity_fixtures.hpp"
 
+namespace test_cloth_elasticity {
+
 using namespace diffsim;
 using namespace fixtures::elasticity;
 using fixtures::kPi;
@@ -232,3 +234,5 @@ TEST(damping_relaxes_over_its_time) {
     problem.x = mapped(problem.cloth.rest, Vec3(std::sqrt(1.0 + 2.0 * e_end), 1.0, 1.0).asDiagonal());
     CHECK(largest(problem.gradient()) < kRounding * 50.0);
 }
+
+}  // namespace test_cloth_elasticity

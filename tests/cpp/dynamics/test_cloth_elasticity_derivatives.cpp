@@ -5,6 +5,8 @@
 
 #include "elasticity_fixtures.hpp"
 
+namespace test_cloth_elasticity_derivatives {
+
 using namespace diffsim;
 using namespace fixtures::elasticity;
 using fixtures::flatten_nodes;
@@ -231,3 +233,5 @@ TEST(a_collapsed_hinge_contributes_nothing) {
     CHECK(largest(problem.gradient()) == 0.0);
     CHECK(problem.hessian(kNothingCut).isZero(0.0));
 }
+
+}  // namespace test_cloth_elasticity_derivatives

@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_free_motion {
+
 using namespace diffsim;
 using fixtures::random_direction;
 using fixtures::random_inertia;
@@ -224,3 +226,5 @@ TEST(a_spin_beyond_all_substeps_is_held_and_says_so) {
         CHECK(grad.orientation.isZero(0.0));
     }
 }
+
+}  // namespace test_free_motion

@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_box_tree {
+
 using namespace diffsim;
 using Pairs = std::vector<std::pair<int, int>>;
 
@@ -137,3 +139,5 @@ TEST(box_of_a_turned_box_contains_its_corners_tightly) {
         CHECK_NEAR(found.upper, expected.upper, 1e-14);
     }
 }
+
+}  // namespace test_box_tree

@@ -7,6 +7,8 @@
 #include "fixtures.hpp"
 #include "geometry/distance.hpp"
 
+namespace test_collision_mesh {
+
 using namespace diffsim;
 using fixtures::TriangleMesh;
 
@@ -233,3 +235,5 @@ TEST(what_is_no_mesh_is_refused) {
     CHECK_THROWS_WITH(build_collision_mesh(three, {{0, 1, 3}}), std::invalid_argument, "out of range");
     CHECK_THROWS_WITH(build_collision_mesh(three, {{0, 1, -1}}), std::invalid_argument, "out of range");
 }
+
+}  // namespace test_collision_mesh

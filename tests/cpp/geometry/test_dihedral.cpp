@@ -4,6 +4,8 @@
 
 #include "cloth_fixtures.hpp"
 
+namespace test_dihedral {
+
 using namespace diffsim;
 using fixtures::kPi;
 using fixtures::random_rotation;
@@ -142,3 +144,5 @@ TEST(angles_wrap_to_half_a_turn) {
     CHECK_NEAR(wrap_angle(6.0), 6.0 - 2.0 * kPi, 1e-15);
     CHECK_NEAR(wrap_angle(-6.0), 2.0 * kPi - 6.0, 1e-15);
 }
+
+}  // namespace test_dihedral

@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_distance {
+
 using namespace diffsim;
 using fixtures::random_direction;
 using fixtures::random_polygon;
@@ -265,3 +267,5 @@ TEST(points_on_the_border_of_a_feature_are_told_apart_from_rounding) {
         CHECK(of_edges.b.border_count == 0);
     }
 }
+
+}  // namespace test_distance

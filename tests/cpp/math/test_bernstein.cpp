@@ -4,6 +4,8 @@
 
 #include "check.hpp"
 
+namespace test_bernstein {
+
 using namespace diffsim;
 
 namespace {
@@ -56,3 +58,5 @@ TEST(a_polynomial_is_positive_for_as_long_as_it_says) {
     CHECK(positive_until(std::array<double, 2>{1.0, -3.0}) == 0.25);  // of a line it is exact
     CHECK(positive_until(std::array<double, 3>{0.0, 1.0, 1.0}) == 0.0);
 }
+
+}  // namespace test_bernstein

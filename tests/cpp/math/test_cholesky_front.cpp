@@ -7,6 +7,8 @@
 #include "check.hpp"
 #include "math/types.hpp"
 
+namespace test_cholesky_front {
+
 using namespace diffsim;
 
 namespace {
@@ -103,3 +105,5 @@ TEST(cholesky_front_refuses_a_pivot_that_is_not_positive) {
         }
     }
 }
+
+}  // namespace test_cholesky_front

@@ -2,6 +2,8 @@
 
 #include "check.hpp"
 
+namespace test_half_symmetric {
+
 using namespace diffsim;
 
 namespace {
@@ -43,3 +45,5 @@ TEST(sums_of_symmetric_matrices_are_those_of_whole_ones) {
     check_sums<15>(random);
     check_sums<18>(random);
 }
+
+}  // namespace test_half_symmetric

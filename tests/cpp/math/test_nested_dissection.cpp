@@ -10,6 +10,8 @@
 
 #include "check.hpp"
 
+namespace test_nested_dissection {
+
 using namespace diffsim;
 using Pairs = std::vector<std::pair<int, int>>;
 
@@ -327,3 +329,5 @@ TEST(nested_dissection_is_deterministic) {
     CHECK(first.order == second.order);
     CHECK(!first.cuts.empty());
 }
+
+}  // namespace test_nested_dissection

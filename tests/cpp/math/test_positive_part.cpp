@@ -3,6 +3,8 @@
 #include "check.hpp"
 #include "math/positive_part.hpp"
 
+namespace test_positive_part {
+
 using namespace diffsim;
 
 namespace {
@@ -35,3 +37,5 @@ TEST(positive_part_keeps_positive_eigenvalues_and_drops_the_others) {
     check_size<15>();
     check_size<18>();
 }
+
+}  // namespace test_positive_part

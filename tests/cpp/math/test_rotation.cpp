@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_rotation {
+
 using namespace diffsim;
 using fixtures::numeric_gradient;
 using fixtures::numeric_jacobian;
@@ -136,3 +138,5 @@ TEST(quaternion_gradients_agree_with_differences) {
             kRounding * covector.norm());
     }
 }
+
+}  // namespace test_rotation

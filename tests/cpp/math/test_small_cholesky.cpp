@@ -4,6 +4,8 @@
 #include "check.hpp"
 #include "math/small_cholesky.hpp"
 
+namespace test_small_cholesky {
+
 using namespace diffsim;
 
 TEST(small_cholesky_agrees_with_a_library) {
@@ -41,3 +43,5 @@ TEST(small_cholesky_refuses_what_is_not_positive_definite) {
         }
     }
 }
+
+}  // namespace test_small_cholesky

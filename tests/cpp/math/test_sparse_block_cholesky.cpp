@@ -12,6 +12,8 @@
 #include "check.hpp"
 #include "math/types.hpp"
 
+namespace test_sparse_block_cholesky {
+
 using namespace diffsim;
 using Pairs = std::vector<std::pair<int, int>>;
 
@@ -389,3 +391,5 @@ TEST(sparse_block_cholesky_is_deterministic) {
     fresh.solve_in_place(shifted.data() + 1);
     CHECK(same_bits(Eigen::Map<const VectorX>(shifted.data() + 1, rhs.size()), x));
 }
+
+}  // namespace test_sparse_block_cholesky

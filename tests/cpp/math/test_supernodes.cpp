@@ -7,6 +7,8 @@
 
 #include "check.hpp"
 
+namespace test_supernodes {
+
 using namespace diffsim;
 using Pairs = std::vector<std::pair<int, int>>;
 
@@ -96,3 +98,5 @@ TEST(supernodes_of_large_grids_have_them_too) {
     check_supernodes(48 * 48, grid(48));
     check_supernodes(70 * 70, grid(70));
 }
+
+}  // namespace test_supernodes

@@ -6,6 +6,8 @@
 
 #include "cloth_fixtures.hpp"
 
+namespace test_cloth {
+
 using namespace diffsim;
 using fixtures::kPi;
 using fixtures::TriangleMesh;
@@ -163,3 +165,5 @@ TEST(what_is_no_cloth_is_refused) {
     const TriangleMesh leaf{{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}}, {{0, 1, 2}, {0, 2, 1}}};
     CHECK_THROWS_WITH(build(leaf), std::invalid_argument, "triangles 0 and 1 have the same corners");
 }
+
+}  // namespace test_cloth

@@ -9,6 +9,8 @@
 #include "cloth_fixtures.hpp"
 #include "geometry/dihedral.hpp"
 
+namespace test_hinge_weights {
+
 using namespace diffsim;
 using fixtures::kPi;
 using fixtures::TriangleMesh;
@@ -186,3 +188,5 @@ TEST(size_does_not_matter) {
     for (Vec3& node : mesh.vertices) node *= 1e-3;
     CHECK_NEAR(weight_matrix(build(mesh)), weight_matrix(cloth), kRounding);
 }
+
+}  // namespace test_hinge_weights

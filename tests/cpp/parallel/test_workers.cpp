@@ -8,6 +8,8 @@
 
 #include "check.hpp"
 
+namespace test_workers {
+
 using namespace diffsim;
 
 namespace {
@@ -148,3 +150,5 @@ TEST(interrupt_is_polled_by_its_maker_alone_and_seen_by_all) {
 }
 
 }  // namespace
+
+}  // namespace test_workers

@@ -5,6 +5,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_contact_model {
+
 using namespace diffsim;
 using fixtures::flatten;
 using fixtures::random_direction;
@@ -490,3 +492,5 @@ TEST(crawling_is_told_where_least_steps_are_asked_for) {
         for (const ContactRow& row : problem.model.rows) CHECK(row.force == 0.0);
     }
 }
+
+}  // namespace test_contact_model

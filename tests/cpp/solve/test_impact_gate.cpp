@@ -2,6 +2,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_impact_gate {
+
 using namespace diffsim;
 
 namespace {
@@ -84,3 +86,5 @@ TEST(gates_hold_at_the_start_however_bodies_spin) {
     CHECK(found >= 100);
     CHECK(beyond >= 5);
 }
+
+}  // namespace test_impact_gate

@@ -7,6 +7,8 @@
 #include "cloth_fixtures.hpp"
 #include "math/rotation.hpp"
 
+namespace test_model_direction {
+
 using namespace diffsim;
 
 namespace {
@@ -317,3 +319,5 @@ TEST(damping_slows_the_bodies_whose_contacts_ask_for_it_alone) {
     }
     CHECK(cases_hit >= 8);
 }
+
+}  // namespace test_model_direction

@@ -5,6 +5,8 @@
 #include "cloth_fixtures.hpp"
 #include "fixtures.hpp"
 
+namespace test_zone_solver {
+
 using namespace diffsim;
 
 namespace {
@@ -104,3 +106,5 @@ TEST(a_press_finds_in_few_steps_that_it_squeezes_a_pile) {
         CHECK(pile.workspace.point.y.bodies[2][5] < -1e-4);  // it goes as far as there is room
     }
 }
+
+}  // namespace test_zone_solver

@@ -5,6 +5,8 @@
 
 #include "check.hpp"
 
+namespace test_object_groups {
+
 using namespace diffsim;
 
 namespace {
@@ -84,3 +86,5 @@ TEST(groups_of_the_next_step_do_not_depend_on_the_last_one) {
         CHECK(fresh.sorted().size() > 100);
     }
 }
+
+}  // namespace test_object_groups

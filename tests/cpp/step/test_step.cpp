@@ -6,6 +6,8 @@
 #include "scene_queries.hpp"
 #include "step_fixtures.hpp"
 
+namespace test_step {
+
 using namespace diffsim;
 using namespace fixtures::steps;
 
@@ -97,3 +99,5 @@ TEST(objects_that_touch_are_refused_by_name) {
     scene.model.bodies[0].name = "crate";
     CHECK_THROWS_WITH(scene.step(), std::invalid_argument, "'crate' and 'ground'");
 }
+
+}  // namespace test_step

@@ -2,6 +2,8 @@
 
 #include "step_fixtures.hpp"
 
+namespace test_step_gradient {
+
 using namespace diffsim;
 using namespace fixtures::steps;
 
@@ -326,3 +328,5 @@ TEST(step_gradient_of_split_coupling) {
 TEST(step_gradient_of_split_coupling_with_soft_contacts) {
     check_step_gradient(with_compliance(with_split(caught_box()), 0.1), 1);
 }
+
+}  // namespace test_step_gradient

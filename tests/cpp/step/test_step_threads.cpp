@@ -1,5 +1,7 @@
 #include "step_fixtures.hpp"
 
+namespace test_step_threads {
+
 using namespace diffsim;
 using namespace fixtures::steps;
 
@@ -82,3 +84,5 @@ TEST(a_step_and_its_backward_do_not_depend_on_the_number_of_threads) {
         scene.state = ends[0];
     }
 }
+
+}  // namespace test_step_threads

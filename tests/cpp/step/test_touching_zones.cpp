@@ -1,6 +1,8 @@
 #include "check.hpp"
 #include "step/touching_zones.hpp"
 
+namespace test_touching_zones {
+
 using namespace diffsim;
 
 namespace {
@@ -83,3 +85,5 @@ TEST(what_a_finder_held_before_does_not_show) {
     CHECK(zones.count() == 3);
     CHECK(zones.exact.empty());
 }
+
+}  // namespace test_touching_zones

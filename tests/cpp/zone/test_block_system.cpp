@@ -5,6 +5,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_block_system {
+
 using namespace diffsim;
 using Pairs = std::vector<std::pair<int, int>>;
 
@@ -177,3 +179,5 @@ TEST(block_system_finds_its_pairs) {
     CHECK(pairs == static_cast<int>(pattern.node_pairs.size()));
     CHECK(mixed >= 5);
 }
+
+}  // namespace test_block_system

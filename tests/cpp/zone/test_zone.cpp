@@ -8,6 +8,8 @@
 #include "zone/contact_row.hpp"
 #include "zone/contacts.hpp"
 
+namespace test_zone {
+
 using namespace diffsim;
 using fixtures::dense;
 using fixtures::flatten;
@@ -306,3 +308,5 @@ TEST(energy_without_contact_is_inertial) {
     CHECK(point.contact_energy == 0.0);
     CHECK_NEAR(derivatives_at(zone, point, Curvature::full).gradient, mass_matrix(zone) * error, 1e-13 * point.energy);
 }
+
+}  // namespace test_zone

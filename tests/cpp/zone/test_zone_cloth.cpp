@@ -8,6 +8,8 @@
 #include "zone/contacts.hpp"
 #include "zone/sides_of.hpp"
 
+namespace test_zone_cloth {
+
 using namespace diffsim;
 using fixtures::dense;
 using fixtures::flatten;
@@ -451,3 +453,5 @@ TEST(patterns_hold_what_elasticity_and_contacts_couple) {
     loose.elastic = false;
     CHECK(base_pattern(loose).node_pairs.empty());
 }
+
+}  // namespace test_zone_cloth

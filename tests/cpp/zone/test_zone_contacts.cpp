@@ -6,6 +6,8 @@
 
 #include "cloth_fixtures.hpp"
 
+namespace test_zone_contacts {
+
 using namespace diffsim;
 using fixtures::random_direction;
 using fixtures::random_rotation;
@@ -387,3 +389,5 @@ TEST(contacts_with_a_driven_body_are_listed_for_all_its_way) {
     collect_contacts(zone, passive, begin, end, coverage);
     CHECK(listed() == all);
 }
+
+}  // namespace test_zone_contacts
