@@ -19,9 +19,12 @@ BIN := $(VENV)/bin
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 unexport PYTHONPATH
 
-INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+# Not byte-compiled: Python does that with what is imported, which is a small part of torch, and once.
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile --constraint constraints.txt
+# ON: a folder of C++ is one unit. From nothing that takes about half as long; after a change in one file, longer.
+UNITY ?= OFF
 CONFIGURE := $(BIN)/cmake -S . -G Ninja "-DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python" \
-             -DDIFFSIM_BUILD_PYTHON=OFF -DDIFFSIM_BUILD_TESTS=ON -DDIFFSIM_WERROR=ON
+             -DDIFFSIM_BUILD_PYTHON=OFF -DDIFFSIM_BUILD_TESTS=ON -DDIFFSIM_WERROR=ON -DCMAKE_UNITY_BUILD=$(UNITY)
 CTEST := $(BIN)/ctest --output-on-failure --parallel 2 --test-dir
 # One thread of torch and BLAS for each worker: they share the processors.
 PYTEST := OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/pytest --numprocesses auto --dist worksteal
@@ -125,7 +128,7 @@ $(VENV)/.with-%: $(SOURCES) $(VENV)/.build-tools
 $(VENV)/.with-test: $(SOURCES) $(shell find tests/cpp -type f) $(VENV)/.build-tools
 	$(INSTALL) --no-build-isolation --config-settings=build-dir=build/test \
 	    --config-settings=cmake.define.DIFFSIM_LTO=OFF --config-settings=cmake.define.DIFFSIM_BUILD_TESTS=ON \
-	    --config-settings=cmake.define.DIFFSIM_WERROR=ON \
+	    --config-settings=cmake.define.DIFFSIM_WERROR=ON --config-settings=cmake.define.CMAKE_UNITY_BUILD=$(UNITY) \
 	    $(if $(shell command -v ccache),--config-settings=cmake.define.CMAKE_CXX_COMPILER_LAUNCHER=ccache) ".[test]"
 	@rm -f $(VENV)/.with-*
 	@touch $@
