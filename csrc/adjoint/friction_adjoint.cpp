@@ -8,10 +8,10 @@
 namespace diffsim {
 namespace {
 
-constexpr int kRounds = 3;           // of multipliers: each leaves about 1 / kStiffening of the slip
-constexpr double kStiffening = 1e3;  // of sticking contacts, times their own
-constexpr double kTolerance = 1e-13;
-constexpr int kMaxIterations = 60;
+constexpr int kMultiplierRounds = 3;      // of multipliers: each leaves about 1 / kStickStiffening of the slip
+constexpr double kStickStiffening = 1e3;  // of sticking contacts, times their own
+constexpr double kLinearTolerance = 1e-13;
+constexpr int kMaxLinear = 60;
 
 }  // namespace
 
@@ -90,7 +90,7 @@ void FrictionAdjoint::add_symmetric(const Term& term, const SmallMatrix& matrix,
 bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
     bool sticks = false;
     for (Term& term : m_terms) {
-        const double stiffness = term.sticks ? kStiffening * term.stiffness : 0.0;
+        const double stiffness = term.sticks ? kStickStiffening * term.stiffness : 0.0;
         const Eigen::Matrix2d along =
             term.sticks ? Eigen::Matrix2d(stiffness * Eigen::Matrix2d::Identity()) : term.symmetric;
         const SmallMatrix symmetric = term.rows * along * term.rows.transpose();
@@ -110,15 +110,15 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
         return result;
     };
     const Coordinates upstream = z;
-    for (int round = 0; round < (sticks ? kRounds : 1); ++round) {
+    for (int round = 0; round < (sticks ? kMultiplierRounds : 1); ++round) {
         z = upstream;
         for (const Term& term : m_terms)
             if (term.sticks) scatter(term, -1.0, SmallVector(term.slip.transpose() * term.multiplier), z);
         system.solve_in_place(z);
-        gmres(m_zone, apply, kTolerance, kMaxIterations, z);
+        gmres(m_zone, apply, kLinearTolerance, kMaxLinear, z);
         for (Term& term : m_terms)
             if (term.sticks)
-                term.multiplier += kStiffening * term.stiffness * (term.rows.transpose() * gather(term, z));
+                term.multiplier += kStickStiffening * term.stiffness * (term.rows.transpose() * gather(term, z));
     }
     return true;
 }

@@ -11,14 +11,14 @@ namespace {
 
 constexpr double kRestingSlip = 1e-11;  // [m]: what slips by less has no direction, and counts as sticking
 
-using Rows = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, 18>;
-using Row = Eigen::Matrix<double, 1, Eigen::Dynamic, Eigen::RowMajor, 1, 18>;
+using Rates = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, 18>;
+using Rate = Eigen::Matrix<double, 1, Eigen::Dynamic, Eigen::RowMajor, 1, 18>;
 
 /// How a contact changes, to first order, when its sides are elsewhere.
 struct Changes {
-    Rows point, normal;           ///< where the surfaces meet; the normal
-    Row force;                    ///< the contact's own
-    std::array<Rows, 2> weights;  ///< of cloth: of each side's three nodes
+    Rates point, normal;           ///< where the surfaces meet; the normal
+    Rate force;                    ///< the contact's own
+    std::array<Rates, 2> weights;  ///< of cloth: of each side's three nodes
 };
 
 /// d(closest point of the feature), its place on the feature held.
@@ -57,10 +57,10 @@ void add_closest_changes(
     constexpr int kA = A::kSize, kB = B::kSize;
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
-    Rows Wa = Rows::Zero(3, kA + kB), Wb = Rows::Zero(3, kA + kB);
+    Rates Wa = Rates::Zero(3, kA + kB), Wb = Rates::Zero(3, kA + kB);
     Wa.leftCols(kA) = material_rows(motion_a);
     Wb.rightCols(kB) = material_rows(motion_b);
-    Rows W = Wa - Wb;
+    Rates W = Wa - Wb;
     const int count = count_a + count_b;
     if (count > 0) {
         const std::array<Vec3, 2> slides_a = slide_directions(geometry.closest.a, n),
@@ -101,8 +101,8 @@ void add_closest_changes(
 
 /// What the mollifier of nearly parallel edges changes by.
 template <class A, class B>
-Row mollifier_change(const ContactGeometry& geometry, const A& a, const B& b) {
-    Row result = Row::Zero(1, A::kSize + B::kSize);
+Rate mollifier_change(const ContactGeometry& geometry, const A& a, const B& b) {
+    Rate result = Rate::Zero(1, A::kSize + B::kSize);
     if (geometry.sine_sq >= kParallelLimit) return result;
     const auto motion_a = motion_of(a, geometry.closest.a.point);
     const auto motion_b = motion_of(b, geometry.closest.b.point);
@@ -119,7 +119,7 @@ template <class A, class B>
 Changes find_changes(const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b) {
     constexpr int kSize = A::kSize + B::kSize;
     Changes changes;
-    changes.point = changes.normal = changes.weights[0] = changes.weights[1] = Rows::Zero(3, kSize);
+    changes.point = changes.normal = changes.weights[0] = changes.weights[1] = Rates::Zero(3, kSize);
     const ClosestPoint &on_a = geometry.closest.a, &on_b = geometry.closest.b;
     const PotentialValue push = normal_force(law, geometry.distance);
     if constexpr (std::is_same_v<B, GroundSide>) {
@@ -136,7 +136,7 @@ Changes find_changes(const ContactGeometry& geometry, const ContactLaw& law, con
                 geometry, law, a, b, on_a.slide_count - on_a.border_count, on_b.slide_count - on_b.border_count, 0.5,
                 changes);
         }
-        const Row distance =
+        const Rate distance =
             relative_row(motion_of(a, on_a.point), motion_of(b, on_b.point), geometry.normal).transpose();
         changes.force = -edge_mollifier(geometry.sine_sq).value * push.stiffness * distance +
                         push.force * mollifier_change(geometry, a, b);
@@ -170,7 +170,7 @@ public:
             m_changes = find_changes(m_geometry, m_contact.law, placed_a.side, placed_b.side);
         m_frame = friction_frame(m_geometry, m_contact.law);
         m_motion = Vec3::Zero();
-        m_motion_of_place = m_motion_of_motion = Rows::Zero(3, kSize);
+        m_motion_of_place = m_motion_of_motion = Rates::Zero(3, kSize);
         add_motion(placed_a, 1.0, 0);
         add_motion(placed_b, -1.0, 1);
         find_slip();
@@ -237,7 +237,7 @@ private:
         if (m_term.sticks) {
             m_force = bound * (m_friction.share - n * n.dot(m_friction.share));
             m_force_of_place = -n * (m_force.transpose() * m_changes.normal);
-            m_force_of_motion = Rows::Zero(3, m_slip_of_motion.cols());
+            m_force_of_motion = Rates::Zero(3, m_slip_of_motion.cols());
             Eigen::Matrix<double, 2, 3> T;
             T << m_frame.tangents[0].transpose(), m_frame.tangents[1].transpose();
             m_term.slip_of_place = T * m_slip_of_place;
@@ -262,7 +262,7 @@ private:
         const Vec3 theta = y.head<3>(), arm = m_frame.point - placed.side.center;
         const Mat3 Jt = left_jacobian(theta).transpose();
         const int o = offset(side);
-        Rows arm_of_place = m_changes.point;
+        Rates arm_of_place = m_changes.point;
         arm_of_place.middleCols<3>(o + 3) -= Mat3::Identity();
         const Vec3 torque = arm.cross(m_force);
         m_term.force_of_place.middleRows<3>(o) +=
@@ -303,7 +303,7 @@ private:
     Changes m_changes;
     FrictionFrame m_frame;
     Vec3 m_motion, m_slip, m_force;
-    Rows m_motion_of_place, m_motion_of_motion, m_slip_of_place, m_slip_of_motion, m_force_of_place, m_force_of_motion;
+    Rates m_motion_of_place, m_motion_of_motion, m_slip_of_place, m_slip_of_motion, m_force_of_place, m_force_of_motion;
 };
 
 }  // namespace

@@ -9,11 +9,11 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxNewtonSteps = 100;
-constexpr int kPatience = 10;         // Newton steps before bounds are kept from following
+constexpr int kMaxBalanceSteps = 100;
+constexpr int kFreezeAfter = 10;      // Newton steps before bounds are kept from following
 constexpr double kBoundChange = 0.1;  // of the largest: bounds that change less may follow again
-constexpr int kMaxRounds = 10;        // of bounds that stand still
-constexpr int kMaxSearch = 30;        // bisections of a line search
+constexpr int kMaxFrozenRounds = 10;  // of bounds that stand still
+constexpr int kMaxBisections = 30;    // bisections of a line search
 constexpr double kFlat = 0.1;         // of the slope at the start: that at the end of a step taken in full
 constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
 constexpr double kLinearTolerance = 1e-8;
@@ -44,13 +44,13 @@ public:
             add_all(nullptr);
             const double left = largest_scaled(m_zone, m_w.gradient);
             if (left <= tolerance && m_frozen) {
-                m_frozen = let_bounds_follow() > kBoundChange && ++rounds < kMaxRounds;
+                m_frozen = let_bounds_follow() > kBoundChange && ++rounds < kMaxFrozenRounds;
                 steps = -1;
                 continue;
             }
             m_result.status = left <= tolerance ? ModelSolution::Status::solved : ModelSolution::Status::crawling;
-            if (left <= tolerance || m_result.newton_steps >= kMaxNewtonSteps) break;
-            if (!m_frozen && steps >= kPatience) {
+            if (left <= tolerance || m_result.newton_steps >= kMaxBalanceSteps) break;
+            if (!m_frozen && steps >= kFreezeAfter) {
                 m_frozen = true;
                 rounds = 0;
             }
@@ -291,7 +291,7 @@ private:
         const double begin = slope(0.0, bound);
         if (slope(1.0, bound) <= kFlat * std::abs(begin)) return 1.0;
         double lower = 0.0, upper = 1.0;
-        for (int k = 0; k < kMaxSearch; ++k) {
+        for (int k = 0; k < kMaxBisections; ++k) {
             const double t = 0.5 * (lower + upper), now = slope(t, bound);
             if (std::abs(now) <= kFlat * std::abs(begin)) return t;
             (now > 0.0 ? upper : lower) = t;

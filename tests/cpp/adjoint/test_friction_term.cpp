@@ -7,6 +7,8 @@
 #include "solve/zone_solver.hpp"
 #include "zone/zone_contacts.hpp"
 
+namespace test_friction_term {
+
 using namespace diffsim;
 
 namespace {
@@ -128,3 +130,5 @@ TEST(the_slip_of_a_sticking_contact_changes_with_the_motion_by_its_rows) {
         }
     }
 }
+
+}  // namespace test_friction_term

@@ -2,6 +2,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_zone_balance {
+
 using namespace diffsim;
 
 namespace {
@@ -60,3 +62,5 @@ TEST(what_is_pulled_by_more_goes_by_the_rest) {
         CHECK_NEAR(friction.share, Vec3(1.0, 0.0, 0.0), 1e-6);
     }
 }
+
+}  // namespace test_zone_balance

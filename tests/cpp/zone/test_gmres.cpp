@@ -4,6 +4,8 @@
 
 #include "fixtures.hpp"
 
+namespace test_gmres {
+
 using namespace diffsim;
 
 TEST(gmres_solves_systems_that_are_not_symmetric) {
@@ -37,3 +39,5 @@ TEST(gmres_solves_systems_that_are_not_symmetric) {
     CHECK(gmres(zone, [](const Coordinates& p) { return p; }, 1e-13, 1, same) <= 1e-14);
     CHECK_NEAR(flat(same), b, 1e-14);
 }
+
+}  // namespace test_gmres
