@@ -122,7 +122,8 @@ INTRODUCTION = (
     " steps. MuJoCo runs without friction and with its default contacts, unless a name says otherwise. Ours keeps"
     " surfaces apart by the scene's thickness, which closed forms take into account; errors of exactly 0 are drawn at"
     " the bottom.",
-    "*RK4 is better on smooth motion*: our steps are implicit Euler, of first order.",
+    "*Smooth motion*: our default steps are implicit Euler, of first order; `trapezoidal` is of second order there,"
+    " keeps what free motion keeps, and pays for contact with a second solve. MuJoCo's RK4 is of fourth order.",
 )
 GRADIENT_INTRODUCTION = (
     "`exact` keeps the curvature of contacts, `qr` and `dense` leave it out as the paper does. Differences are central."

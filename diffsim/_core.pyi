@@ -63,6 +63,7 @@ class Options:
         coupling: str = "monolithic",
         zones: str = "local",
         newton_iterations: int | None = None,
+        integrator: str = "implicit_euler",
     ) -> None: ...
     dt: float
     compliance: float
@@ -73,6 +74,7 @@ class Options:
     zones: str
     @property
     def newton_iterations(self) -> int | None: ...
+    integrator: str
 
 class Tape:
     """What the backward of a rollout needs."""

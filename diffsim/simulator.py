@@ -68,6 +68,9 @@ class Simulator(SceneIdentity, Measurements):
         compliance: How far contacts give way: about this part of what gravity moves a body in one step. 0: not at all,
             at the price of a few more Newton steps (the quadratic program of Eq. 6 as written).
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
+        integrator: "implicit_euler", of first order, or "trapezoidal", of second order where bodies move freely: a
+            projectile is exact and free spin keeps its energy. What is in contact has a second solve, and cloth keeps
+            implicit Euler (docs/conventions.md).
         coupling: "monolithic" or "split": whether cloth and what touches it are solved at once, or the cloth's elastic
             step first and its contacts after it, as the paper does. Without cloth the two are the same.
         zones: "local": bodies and cloths are solved together only if they may meet, the default. "global": all at once,
@@ -105,6 +108,7 @@ class Simulator(SceneIdentity, Measurements):
         thickness: float | None = None,
         compliance: float = 1e-4,
         adjoint: str = "exact",
+        integrator: str = "implicit_euler",
         coupling: str = "monolithic",
         zones: str = "local",
         newton_iterations: int | None = None,
@@ -118,6 +122,7 @@ class Simulator(SceneIdentity, Measurements):
         where = "Simulator"
         check_instance(where, "scene", scene, Scene, "be a diffsim.Scene")
         check_choice(where, "adjoint", adjoint, ("exact", "qr", "dense"))
+        check_choice(where, "integrator", integrator, ("implicit_euler", "trapezoidal"))
         check_choice(where, "coupling", coupling, ("monolithic", "split"))
         check_choice(where, "zones", zones, ("local", "global"))
         check_choice(where, "on_failure", on_failure, ("warn", "raise"))
@@ -127,6 +132,7 @@ class Simulator(SceneIdentity, Measurements):
             "compliance": compliance,
             "adjoint": adjoint,
             "tolerance": check_number(where, "tolerance", tolerance, above=0.0),
+            "integrator": integrator,
             "coupling": coupling,
             "zones": zones,
             "newton_iterations": _checked_iterations(newton_iterations, coupling),

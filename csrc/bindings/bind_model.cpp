@@ -165,6 +165,16 @@ bool parse_zones(const std::string& text) {
     return text == "global";
 }
 
+Integrator parse_integrator(const std::string& text) {
+    if (text == "implicit_euler") return Integrator::implicit_euler;
+    if (text == "trapezoidal") return Integrator::trapezoidal;
+    throw std::invalid_argument("integrator must be 'implicit_euler' or 'trapezoidal', got '" + text + "'");
+}
+
+const char* integrator_text(Integrator integrator) {
+    return integrator == Integrator::trapezoidal ? "trapezoidal" : "implicit_euler";
+}
+
 const char* zones_text(bool global) { return global ? "global" : "local"; }
 
 const char* coupling_text(bool split) { return split ? "split" : "monolithic"; }
@@ -206,7 +216,8 @@ void bind_model(py::module_& module) {
     py::class_<Options>(module, "Options", "How steps are taken.")
         .def(
             py::init([](double dt, double compliance, const std::string& adjoint, double tolerance, int max_iterations,
-                        const std::string& coupling, const std::string& zones, std::optional<int> newton_iterations) {
+                        const std::string& coupling, const std::string& zones, std::optional<int> newton_iterations,
+                        const std::string& integrator) {
                 if (newton_iterations && !parse_coupling(coupling))
                     throw std::invalid_argument("newton_iterations needs coupling 'split'");
                 Options options;
@@ -218,13 +229,15 @@ void bind_model(py::module_& module) {
                 options.split = parse_coupling(coupling);
                 options.global_zone = parse_zones(zones);
                 options.newton_iterations = newton_iterations;
+                options.integrator = parse_integrator(integrator);
                 return options;
             }),
             py::kw_only(), py::arg("dt"), py::arg("compliance") = defaults.compliance,
             py::arg("adjoint") = adjoint_text(defaults.adjoint), py::arg("tolerance") = defaults.tolerance,
             py::arg("max_iterations") = defaults.max_iterations, py::arg("coupling") = coupling_text(defaults.split),
             py::arg("zones") = zones_text(defaults.global_zone),
-            py::arg("newton_iterations") = defaults.newton_iterations)
+            py::arg("newton_iterations") = defaults.newton_iterations,
+            py::arg("integrator") = integrator_text(defaults.integrator))
         .def_readwrite("dt", &Options::dt)
         .def_readwrite("compliance", &Options::compliance)
         .def_readwrite("tolerance", &Options::tolerance)
@@ -238,7 +251,10 @@ void bind_model(py::module_& module) {
         .def_property(
             "zones", [](const Options& options) { return zones_text(options.global_zone); },
             [](Options& options, const std::string& text) { options.global_zone = parse_zones(text); })
-        .def_readonly("newton_iterations", &Options::newton_iterations);
+        .def_readonly("newton_iterations", &Options::newton_iterations)
+        .def_property(
+            "integrator", [](const Options& options) { return integrator_text(options.integrator); },
+            [](Options& options, const std::string& text) { options.integrator = parse_integrator(text); });
 }
 
 }  // namespace diffsim::bindings

@@ -7,14 +7,11 @@
 #include <cmath>
 #include <vector>
 
+#include "dynamics/substeps.hpp"
 #include "math/rotation.hpp"
 
 namespace diffsim {
 namespace {
-
-constexpr double kMaxAnglePerSubstep = 1.0;  // [rad]; Newton converges from w0 for any inertia we tried
-constexpr int kMaxSubsteps = 1 << 20;
-constexpr int kMaxNewtonSteps = 30;
 
 struct Substep {
     Vec3 angular_velocity;
@@ -71,11 +68,6 @@ std::vector<Substep> solve_substeps(
     return substeps;
 }
 
-Vec3 initial_guess(const Mat3& inertia_world, const Vec3& angular_velocity, const Vec3& torque, double dt) {
-    if (torque.isZero(0.0)) return angular_velocity;
-    return angular_velocity + inertia_world.llt().solve(dt * torque);
-}
-
 }  // namespace
 
 FreeRotation free_rotation(
@@ -85,7 +77,7 @@ FreeRotation free_rotation(
     const Vec3 momentum = inertia_world * angular_velocity + dt * torque;
     const Vec3 guess = initial_guess(inertia_world, angular_velocity, torque, dt);
     const double angle = dt * std::max(angular_velocity.norm(), guess.norm());
-    int count = static_cast<int>(std::min(std::ceil(std::max(angle / kMaxAnglePerSubstep, 1.0)), 1.0 * kMaxSubsteps));
+    int count = substeps_for(angle);
     if (count == 1) {
         const Substep single = solve_substep(R0, guess, momentum, inertia_body, dt);
         if (single.converged) return {single.angular_velocity, dt * single.angular_velocity, 1};

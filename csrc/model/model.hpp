@@ -66,6 +66,12 @@ struct Model {
 /// How the backward of a step treats the contact terms; see contact/adjoint.hpp.
 enum class AdjointMode { exact, qr, dense };
 
+/// The time scheme, see step/step.hpp.
+enum class Integrator { implicit_euler, trapezoidal };
+
+/// What a solve is for: with implicit Euler the whole step, else the new velocities or the new places.
+enum class StepPart { whole, velocities, places };
+
 /// Contacts give way to a resting body's weight by about this part of what gravity moves it in a step.
 inline constexpr double kDefaultCompliance = 1e-4;
 
@@ -79,6 +85,8 @@ struct Options {
     bool global_zone = false;  ///< all that yields is one zone, whether it meets or not
     /// Newton iterates that make up the elastic pass of split coupling, 1 for Eq. 3 of [qiao2020scalable]; none: it converges.
     std::optional<int> newton_iterations;
+    Integrator integrator = Integrator::implicit_euler;
+    StepPart part = StepPart::whole;  ///< set by the step itself
 };
 
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.

@@ -325,7 +325,8 @@ void rollout_backward(
 
 namespace {
 
-/// Call visit(model, options, parameters, control, record) for the last step of a scene.
+/// Call visit(model, options, parameters, control, record) for the last step of a scene; of one in two parts for that which
+/// is about velocities, and so about forces.
 template <class Visit>
 auto with_last_step(const Tape& tape, const RolloutInputs& inputs, int scene, const Visit& visit) {
     const Model& model = *tape.model;
@@ -333,7 +334,10 @@ auto with_last_step(const Tape& tape, const RolloutInputs& inputs, int scene, co
     Workers workers(1);
     SceneControl control;
     read_control(model, inputs, tape.shape.steps - 1, scene, record.start, workers, control);
-    return visit(model, tape.options, read_parameters(model, inputs, scene), control, record);
+    Options options = tape.options;
+    if (record.velocities) options.part = StepPart::velocities;
+    const StepRecord& part = record.velocities ? *record.velocities : record;
+    return visit(model, options, read_parameters(model, inputs, scene), control, part);
 }
 
 }  // namespace

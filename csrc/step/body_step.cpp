@@ -4,15 +4,42 @@
 #include <algorithm>
 
 #include "collision/candidates.hpp"
+#include "dynamics/conserving_rotation.hpp"
 #include "math/rotation.hpp"
 #include "zone/motion_bounds.hpp"
 
 namespace diffsim {
 namespace {
 
-/// Velocity at the end of a step in which nothing touches the body: v0 + dt (g + f / m).
+/// Velocity of a body that nothing touches: v0 + t (g + f / m), at the end of the step or, where it is for places, in the middle.
 Vec3 free_velocity(const StepSetting& setting, int id, const BodyState& state, const BodyControl& control) {
-    return state.velocity + setting.dt * (setting.parameters.gravity + control.force / setting.parameters.mass[id]);
+    return state.velocity +
+           setting.acceleration_time() * (setting.parameters.gravity + control.force / setting.parameters.mass[id]);
+}
+
+/// How a body turns that nothing touches. Where the step is for velocities it turns by dt w1, if that is an angle at all, so
+/// that what contact leaves of the turn is the velocity it leaves.
+FreeRotation free_turn(const StepSetting& setting, int id, const BodyState& state, const BodyControl& control) {
+    const auto solve = setting.part == StepPart::whole ? free_rotation : conserving_rotation;
+    FreeRotation result = solve(
+        quaternion_to_matrix(state.orientation), state.angular_velocity, control.torque, setting.parameters.inertia[id],
+        setting.dt);
+    if (setting.part == StepPart::velocities && result.substeps == 1)
+        result.rotation = setting.dt * result.angular_velocity;
+    return result;
+}
+
+FreeRotationGradient free_turn_backward(
+    const StepSetting& setting, int id, const BodyState& state, const BodyControl& control,
+    const FreeRotation& rotation, Vec3 grad_angular_velocity, Vec3 grad_rotation, bool with_inertia) {
+    if (setting.part == StepPart::velocities && rotation.substeps == 1) {
+        grad_angular_velocity += setting.dt * grad_rotation;
+        grad_rotation.setZero();
+    }
+    const auto backward = setting.part == StepPart::whole ? free_rotation_backward : conserving_rotation_backward;
+    return backward(
+        quaternion_to_matrix(state.orientation), state.angular_velocity, control.torque, setting.parameters.inertia[id],
+        setting.dt, rotation, grad_angular_velocity, grad_rotation, with_inertia);
 }
 
 }  // namespace
@@ -21,9 +48,7 @@ BodyStart begin_body(const StepSetting& setting, int id, const BodyState& state,
     BodyStart start;
     switch (setting.model.bodies[id].kind) {
         case BodyKind::dynamic:
-            start.rotation = free_rotation(
-                quaternion_to_matrix(state.orientation), state.angular_velocity, control.torque,
-                setting.parameters.inertia[id], setting.dt);
+            start.rotation = free_turn(setting, id, state, control);
             start.body = moving_body(setting, id, state, control, start.rotation);
             start.motion = start.body.target;
             break;
@@ -44,8 +69,10 @@ ZoneBody moving_body(
     body.id = id;
     body.start = {quaternion_to_matrix(state.orientation), state.position};
     body.inertia = body.start.R * setting.parameters.inertia[id] * body.start.R.transpose();
+    body.weight = setting.body_weight();
+    body.inertia *= body.weight;
     body.inverse_inertia = body.inertia.inverse();
-    body.mass = setting.parameters.mass[id];
+    body.mass = body.weight * setting.parameters.mass[id];
     body.target << rotation.rotation, dt * free_velocity(setting, id, state, control);
     body.last_motion << dt * state.angular_velocity, dt * state.velocity;
     if (rotation.substeps == 0) body.last_motion.head<3>().setZero();  // it is held
@@ -141,35 +168,37 @@ void dynamic_backward(
     const BodyStateGradient up = gradient;
     const Mat3 R0 = quaternion_to_matrix(state.orientation);
     const Mat3& inertia_body = setting.parameters.inertia[id];
-    const double mass = setting.parameters.mass[id];
+    const double mass = setting.parameters.mass[id], weight = setting.body_weight();
 
     // M z: what reaches the target ŷ. Without contact M z is the upstream gradient itself.
     Vec6 mass_z = body_upstream(up, y, dt);
     Vec3 turn_covector = Vec3::Zero();  // of R0, through M and the contacts
     if (adjoint.in_zone) {
         const Vec6& z = adjoint.multiplier;
-        const Mat3 inertia = R0 * inertia_body * R0.transpose();
-        mass_z << inertia * z.head<3>(), mass * z.tail<3>();
+        Mat3 inertia = R0 * inertia_body * R0.transpose();
+        inertia *= weight;
+        mass_z << inertia * z.head<3>(), weight * mass * z.tail<3>();
         const Vec3 target_shift = dt * free_velocity(setting, id, state, control);
         const Vec3 turn_error = y.head<3>() - rotation.rotation;
         turn_covector -= inertia_rotation_gradient(inertia, turn_error, z.head<3>());
-        if (needs.inertia) parameter_gradient.inertia[id] -= inertia_body_gradient(R0, turn_error, z.head<3>());
-        parameter_gradient.mass[id] -= z.tail<3>().dot(y.tail<3>() - target_shift);
+        if (needs.inertia)
+            parameter_gradient.inertia[id] -= weight * inertia_body_gradient(R0, turn_error, z.head<3>());
+        parameter_gradient.mass[id] -= weight * z.tail<3>().dot(y.tail<3>() - target_shift);
     }
     // w1 = ŵ + (turn - target turn) / dt, v1 = v̂ + (shift - dt v̂) / dt = shift / dt
     const Vec3 grad_rotation = mass_z.head<3>() - up.angular_velocity / dt;
     const Vec3 grad_free_velocity = dt * mass_z.tail<3>();
-    const FreeRotationGradient free = free_rotation_backward(
-        R0, state.angular_velocity, control.torque, inertia_body, dt, rotation, up.angular_velocity, grad_rotation,
-        needs.inertia);
+    const FreeRotationGradient free =
+        free_turn_backward(setting, id, state, control, rotation, up.angular_velocity, grad_rotation, needs.inertia);
     const Vec3 end_covector = up.orientation + adjoint.pose.head<3>();
     gradient.orientation = exp_rotation(y.head<3>()).transpose() * end_covector + turn_covector + free.orientation;
     gradient.position = up.position + adjoint.pose.tail<3>();
     gradient.velocity = grad_free_velocity;
     gradient.angular_velocity = free.angular_velocity;
     if (needs.inertia) parameter_gradient.inertia[id] += free.inertia_body;
-    parameter_gradient.mass[id] -= dt / (mass * mass) * control.force.dot(grad_free_velocity);
-    control_gradient.force += dt / mass * grad_free_velocity;
+    const double time = setting.acceleration_time();
+    parameter_gradient.mass[id] -= time / (mass * mass) * control.force.dot(grad_free_velocity);
+    control_gradient.force += time / mass * grad_free_velocity;
     control_gradient.torque += free.torque;
 }
 

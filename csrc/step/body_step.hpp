@@ -8,7 +8,8 @@
 #include "zone/zone.hpp"
 
 /// The time scheme of one rigid body: how its step begins, how it ends, and the backward of both. Implicit Euler: momentum form
-/// for turns (dynamics/free_motion.hpp), the velocity at the end of the step for shifts.
+/// for turns (dynamics/free_motion.hpp), the velocity at the end of the step for shifts. Trapezoidal, by the part of the step:
+/// velocities as implicit Euler has them but for dynamics/conserving_rotation.hpp, places by mean velocities.
 namespace diffsim {
 
 /// A body at the start of a step.

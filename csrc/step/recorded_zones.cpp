@@ -87,7 +87,8 @@ void RecordedZones::join_body(ZoneMemory& memory, std::vector<int>& local, int i
     body.id = id;
     if (m_model.bodies[id].is_dynamic()) {
         body = moving_body(
-            {m_model, m_parameters, m_options.dt}, id, state, m_control.bodies[id], m_record.free_rotation[id]);
+            {m_model, m_parameters, m_options.dt, m_options.part}, id, state, m_control.bodies[id],
+            m_record.free_rotation[id]);
     } else {
         body.start = {quaternion_to_matrix(state.orientation), state.position};
         body.target = m_record.y.bodies[id];

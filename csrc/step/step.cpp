@@ -10,6 +10,7 @@
 #include "step/cloth_step.hpp"
 #include "step/driven_bodies.hpp"
 #include "step/group_step.hpp"
+#include "step/step_part.hpp"
 
 namespace diffsim {
 namespace {
@@ -66,7 +67,7 @@ public:
           m_workspace(workspace),
           m_scratch(*workspace.forward),
           m_info(info),
-          m_setting{model, parameters, options.dt},
+          m_setting{model, parameters, options.dt, options.part},
           m_group_step(model, options, parameters, state, control, workspace.interrupt) {}
 
     SceneState run(StepRecord* record) {
@@ -432,10 +433,10 @@ std::size_t StepRecord::bytes() const {
            (start.node_position.capacity() + start.node_velocity.capacity() + y.nodes.capacity() +
             elastic_shift.capacity()) *
                sizeof(Vec3) +
-           zones.bytes();
+           zones.bytes() + (velocities ? velocities->bytes() : 0);
 }
 
-SceneState step(
+SceneState solve_part(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record) {
     return Stepper(model, options, parameters, state, control, workspace, info).run(record);

@@ -17,6 +17,14 @@
 #include "step/touching_zones.hpp"
 
 /// One time step and its backward: the only place that knows the whole order.
+///
+/// With implicit Euler a step is one solve: y is the minimiser of [zone/zone.hpp] for targets ŷ = dt v̂, v̂ the velocity at the
+/// end of free motion, and the new velocities are y / dt. The trapezoidal scheme has two solves from the same start:
+///  * velocities: that of implicit Euler, whose y / dt are the new velocities, so that contact is inelastic, what rests has
+///    none, and momentum is kept among bodies in contact;
+///  * places: targets ŷ = dt (v0 + v̂) / 2, bodies of double weight. What contact does to places is then dt² f / (2 m), as
+///    what gravity does is dt² g / 2; forces, and compressions at rest, are those of the other solve.
+/// Cloth has the targets of implicit Euler in both.
 namespace diffsim {
 
 /// What the backward of a step needs: O(bodies + contacts).
@@ -27,6 +35,8 @@ struct StepRecord {
     Coordinates y;                            ///< the motion of the step: (turn, shift) per body, shift per node
     std::vector<Vec3> elastic_shift;          ///< per node: its motion without contact; with split coupling only
     TouchingZones zones;
+    /// Of a trapezoidal step that has two parts: this one is of the places then.
+    std::unique_ptr<StepRecord> velocities;
 
     std::size_t bytes() const;
 };

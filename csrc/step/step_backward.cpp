@@ -5,6 +5,7 @@
 #include "step/body_step.hpp"
 #include "step/cloth_step.hpp"
 #include "step/recorded_zones.hpp"
+#include "step/step_part.hpp"
 #include "step/thread_memory.hpp"
 
 namespace diffsim {
@@ -29,7 +30,7 @@ public:
         SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient)
         : m_model(model),
           m_options(options),
-          m_setting{model, parameters, options.dt},
+          m_setting{model, parameters, options.dt, options.part},
           m_control(control),
           m_record(record),
           m_zones(model, options, parameters, control, record),
@@ -105,11 +106,13 @@ private:
             m_needs, m_gradient.bodies[i], m_control_gradient.bodies[i], m_parameter_gradient);
     }
 
-    /// v̂ = v0 + dt (g + f / m): gravity gets dt times what the velocity at the start gets.
+    /// v̂ = v0 + dt (g + f / m): gravity gets dt times what the velocity at the start gets, from a body that moves by its mean
+    /// velocity half of that.
     void add_gravity() {
         Vec3 sum = Vec3::Zero();
         for (std::size_t i = 0; i < m_model.bodies.size(); ++i)
             if (m_model.bodies[i].is_dynamic()) sum += m_gradient.bodies[i].velocity;
+        sum *= m_setting.acceleration_time() / m_options.dt;
         for (const Cloth& cloth : m_model.cloths)
             for (int k = 0; k < cloth.node_count(); ++k)
                 if (!cloth.pinned[k]) sum += m_gradient.node_velocity[cloth.first_node + k];
@@ -172,7 +175,7 @@ private:
 
 }  // namespace
 
-void step_backward(
+void part_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {

@@ -10,7 +10,14 @@ namespace diffsim {
 struct StepSetting {
     const Model& model;
     const Parameters& parameters;
-    double dt;  ///< [s]
+    double dt;      ///< [s]
+    StepPart part;  ///< of the step
+
+    /// For how long forces have acted on the velocity that a free body moves with [s]: the whole step, or the half of it
+    /// after which the velocity is the mean one.
+    double acceleration_time() const { return part == StepPart::places ? 0.5 * dt : dt; }
+    /// See ZoneBody::weight.
+    double body_weight() const { return part == StepPart::places ? 2.0 : 1.0; }
 };
 
 /// d(loss)/d(Parameters).

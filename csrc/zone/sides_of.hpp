@@ -21,7 +21,7 @@ public:
     const Feature& feature() const { return m_feature; }
     const CollisionMesh& mesh() const { return m_zone.mesh(m_body); }
     bool yields() const { return m_zone.yields(m_body); }
-    double mass() const { return m_zone.bodies[m_body].mass; }
+    double mass() const { return m_zone.bodies[m_body].mass / m_zone.bodies[m_body].weight; }
     Surface surface(const std::vector<Pose>& poses, const std::vector<Vec3>&) const {
         return {&mesh(), &poses[m_body], nullptr};
     }

@@ -22,7 +22,8 @@ struct ZoneBody {
     Pose start;                   ///< at the start of the step, zone frame
     Mat3 inertia = Mat3::Zero();  ///< R0 I_b R0ᵀ; dynamic bodies only
     Mat3 inverse_inertia = Mat3::Zero();
-    double mass = kInfinity;     ///< infinite for bodies that do not yield
+    double mass = kInfinity;  ///< infinite for bodies that do not yield
+    double weight = 1.0;      ///< the mass and inertia here over the body's own, by which contacts have their stiffness
     Vec6 target = Vec6::Zero();  ///< ŷ: where a dynamic body goes when nothing touches it, a kinematic one is driven
     Vec6 last_motion = Vec6::Zero();  ///< last step's motion: dt (w0, v0)
 };

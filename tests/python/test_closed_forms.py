@@ -57,10 +57,10 @@ def test_flight_is_implicit_euler() -> None:
     np.testing.assert_allclose([float(x) for x in found], expected, rtol=ROUNDING)
 
 
-def tumbling(dt: float, time: float) -> Tensor:
+def tumbling(dt: float, time: float, **options: Any) -> Tensor:
     scene = ds.Scene(gravity=(0, 0, 0))
     brick(scene, orientation=(0.8, 0.1, -0.5, 0.3), angular_velocity=(1.0, 3.0, 0.5))
-    sim = simulator(scene, dt)
+    sim = simulator(scene, dt, **options)
     return sim.rollout(sim.initial_state(), None, round(time / dt))[-1].orientation[0]
 
 

@@ -299,6 +299,11 @@ Scene with_compliance(Scene scene, double compliance) {
     return scene;
 }
 
+Scene by_trapezoids(Scene scene) {
+    scene.options.integrator = Integrator::trapezoidal;
+    return scene;
+}
+
 }  // namespace
 
 TEST(step_gradient_in_flight) { check_step_gradient(tumbling(), 0); }
@@ -327,6 +332,15 @@ TEST(step_gradient_of_split_coupling) {
 }
 TEST(step_gradient_of_split_coupling_with_soft_contacts) {
     check_step_gradient(with_compliance(with_split(caught_box()), 0.1), 1);
+}
+TEST(step_gradient_of_the_trapezoidal_scheme) {
+    check_step_gradient(by_trapezoids(tumbling()), 0);
+    check_step_gradient(by_trapezoids(tilted_landing()), 1);
+    check_step_gradient(by_trapezoids(free_collision()), 1);
+    check_step_gradient(by_trapezoids(pushed_ball()), 2);
+    check_step_gradient(by_trapezoids(caught_box()), 1);
+    check_step_gradient(by_trapezoids(with_split(caught_box())), 1);
+    check_step_gradient(by_trapezoids(with_compliance(caught_box(), 0.0)), 1, 10.0 * kDifferences);
 }
 
 }  // namespace test_step_gradient
