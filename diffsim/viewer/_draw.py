@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._extras import require
+from .._inputs import Controls
 from ..simulator import Simulator
 from ..state import State
-from ._recording import FloatArray, Part, as_trajectory, make_recording
+from ._forces import with_forces
+from ._recording import ARROWS, Arrows, FloatArray, Part, as_trajectory, make_recording
 
 LIGHT = np.array([-0.35, -0.55, 1.0]) / np.linalg.norm([-0.35, -0.55, 1.0])
 _BACKGROUND, _SHADOW = np.array([0.955, 0.955, 0.965]), np.array([0.86, 0.86, 0.885])
@@ -132,6 +134,23 @@ def frame(axes: Any, low: FloatArray, high: FloatArray) -> None:
         spine.set_visible(False)
 
 
+def paint_arrows(axes: Any, arrows: Arrows, camera: Camera, alpha: float = 1.0) -> None:
+    """Put contact forces into the axes, over everything."""
+    if len(arrows.starts):
+        starts, vectors = camera.project(arrows.starts), camera.project(arrows.vectors)
+        axes.quiver(
+            *starts[:, :2].T,
+            *vectors[:, :2].T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            width=0.004,
+            color=ARROWS,
+            alpha=alpha,
+            zorder=3,
+        )
+
+
 def split_faces(vertices: FloatArray, faces: Any, longest: float) -> tuple[FloatArray, Any]:
     """The mesh with its long triangles split."""
     import trimesh
@@ -178,6 +197,9 @@ def picture(
     times: Sequence[float] | None = None,
     camera: Camera | None = None,
     colors: Mapping[Any, Sequence[float]] | None = None,
+    contacts: bool = False,
+    controls: Controls = None,
+    force_scale: float | None = None,
     axes: Any = None,
     size: tuple[float, float] = (6.4, 4.0),
 ) -> Any:
@@ -192,6 +214,9 @@ def picture(
         times: Moments, after the first state [s]; takes the place of `count`. Each shows the nearest state.
         camera: Default: `Camera()`.
         colors: Red, green and blue from 0 to 1 by name or handle, of objects that shall not have the default colour.
+        contacts: Whether to show contact forces, as arrows over everything else; see `record`.
+        controls: What drove the steps, for contacts; see `record`.
+        force_scale: Length of an arrow by its force [m/N]; see `record`.
         axes: Of matplotlib, to draw into. Default: those of a new figure.
         size: Of that figure [inches].
     Returns: The matplotlib figure.
@@ -205,30 +230,38 @@ def picture(
     wanted = np.linspace(0, steps - 1, count) if times is None else np.asarray(times, dtype=np.float64) / sim.dt
     frames = np.unique(np.clip(np.round(wanted).astype(int), 0, steps - 1))
     recording = make_recording(where, sim, states, frames, colors)
+    if contacts:
+        recording = with_forces(where, recording, sim, states, frames, controls, force_scale)
     camera = camera or Camera()
     items = []
-    for index in range(len(frames)):
-        age = (len(frames) - 1 - index) / max(len(frames) - 1, 1)
+    alphas = 1.0 - 0.72 * np.linspace(1.0, 0.0, len(frames)) if len(frames) > 1 else np.ones(1)
+    for index, alpha in enumerate(alphas.tolist()):
         for part in recording.parts:
             still = part.poses is None and part.nodes is None
             if still and index:
                 continue
-            items.append(item_of(part, index, alpha=1.0 if still else 1.0 - 0.72 * age))
+            items.append(item_of(part, index, alpha=1.0 if still else alpha))
     figure = figures.Figure(figsize=size, layout="constrained") if axes is None else axes.figure
     ground = None if recording.ground is None else float(recording.ground.vertices[0, 2])
-    draw_items(
-        figure.add_subplot() if axes is None else axes,
-        items,
-        camera,
-        shadows=ground is not None,
-        ground_height=ground or 0.0,
-    )
+    if axes is None:
+        axes = figure.add_subplot()
+    draw_items(axes, items, camera, shadows=ground is not None, ground_height=ground or 0.0)
+    for arrows, alpha in zip(recording.arrows or [], alphas.tolist()):
+        paint_arrows(axes, arrows, camera, alpha)
+        _widen(axes, camera.project(np.concatenate([arrows.starts, arrows.starts + arrows.vectors]))[:, :2])
     if path is not None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         _save(figure, path, None)
     figure._repr_png_ = lambda: _png(figure)  # notebooks ask for it; pyplot, which draws there else, is not involved
     return figure
+
+
+def _widen(axes: Any, points: FloatArray) -> None:
+    """So that the picture shows these, too."""
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    low, high = np.min([low, *points], axis=0), np.max([high, *points], axis=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
 
 
 def _save(figure: Any, target: Any, kind: str | None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
-from ._draw import Camera, frame, item_of, paint, split_faces
+from ._draw import Camera, frame, item_of, paint, paint_arrows, split_faces
 from ._recording import Part, Recording
 
 _DPI = 100.0
@@ -70,6 +70,8 @@ def _frames(
         axes.clear()
         items = [item_of(part, index) for part in parts]
         paint(axes, items, [(item.mesh.vertices, item.mesh.faces) for item in items], camera, ground)
+        if recording.arrows is not None:
+            paint_arrows(axes, recording.arrows[index], camera)
         frame(axes, low, high)
         figure.patch.set_facecolor(axes.get_facecolor())
         axes.text(0.015, 0.02, f"{time:.2f} s", transform=axes.transAxes, color="0.45", fontsize=9)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..rotation import from_matrix
-from ._recording import FloatArray, Part, Recording
+from ._arrow import WIDTH, scales, turns, unit_arrow
+from ._recording import ARROWS, Color, FloatArray, Part, Recording
 
 _FLOAT, _UINT32 = 5126, 5125
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
@@ -53,8 +54,8 @@ class _Builder:
             entry["min"], entry["max"] = np.atleast_1d(values.min(0)).tolist(), np.atleast_1d(values.max(0)).tolist()
         return self.append("accessors", entry)
 
-    def animate(self, node: int, path: str, times: int, values: NDArray[Any]) -> None:
-        self.samplers.append({"input": times, "output": self.accessor(values), "interpolation": "LINEAR"})
+    def animate(self, node: int, path: str, times: int, values: NDArray[Any], kind: str = "LINEAR") -> None:
+        self.samplers.append({"input": times, "output": self.accessor(values), "interpolation": kind})
         self.channels.append({"sampler": len(self.samplers) - 1, "target": {"node": node, "path": path}})
 
 
@@ -63,7 +64,8 @@ def write_glb(recording: Recording, path: Path, speed: float) -> None:
     builder = _Builder()
     times = builder.accessor(recording.times / speed, bounds=True)
     parts = [*recording.parts, *([] if recording.ground is None else [recording.ground])]
-    children = [_add(builder, part, times) for part in parts]
+    children = [_add(builder, part, times, recording.opacity) for part in parts]
+    children += _add_arrows(builder, recording, times)
     root = builder.append("nodes", {"name": "scene, z up", "rotation": _Z_UP, "children": children})
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "diffsim"},
@@ -81,14 +83,14 @@ def write_glb(recording: Recording, path: Path, speed: float) -> None:
     path.write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
 
 
-def _add(builder: _Builder, part: Part, times: int) -> int:
+def _add(builder: _Builder, part: Part, times: int, opacity: float) -> int:
     """A node with the part's mesh, and its motion."""
     frames = builder.document["accessors"][times]["count"]
     vertices, faces = part.vertices, part.faces
     primitive: dict[str, Any] = {
         "attributes": {"POSITION": builder.accessor(vertices, bounds=True)},
         "indices": builder.accessor(faces.reshape(-1).astype(np.uint32)),
-        "material": builder.append("materials", _material(part)),
+        "material": builder.append("materials", _material(part.color, opacity, part.two_sided)),
     }
     if part.smooth:  # without normals viewers shade flat
         primitive["attributes"]["NORMAL"] = builder.accessor(_normals(vertices, faces))
@@ -109,10 +111,35 @@ def _add(builder: _Builder, part: Part, times: int) -> int:
     return node
 
 
-def _material(part: Part) -> dict[str, Any]:
-    linear = [float(c) for c in np.asarray(part.color) ** 2.2]  # glTF's factors are not gamma-coded
-    surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
-    return {"pbrMetallicRoughness": surface, "doubleSided": part.two_sided}
+def _add_arrows(builder: _Builder, recording: Recording, times: int) -> list[int]:
+    """Nodes with one arrow each, which jump from frame to frame, and are of no size where a frame has fewer."""
+    starts, vectors = recording.arrows_in_slots()
+    if not vectors.size:
+        return []
+    vertices, faces = unit_arrow()
+    primitive = {
+        "attributes": {"POSITION": builder.accessor(vertices, bounds=True)},
+        "indices": builder.accessor(faces.reshape(-1).astype(np.uint32)),
+        "material": builder.append("materials", _material(ARROWS, 1.0, False)),
+    }
+    mesh = builder.append("meshes", {"name": "contact force", "primitives": [primitive]})
+    sizes, nodes = scales(vectors, WIDTH * recording.size), []
+    for slot in range(starts.shape[1]):
+        turn = _quaternions(turns(vectors[:, slot]))
+        now = {"translation": starts[0, slot], "rotation": turn[0], "scale": sizes[0, slot]}
+        node = {"name": f"contact force {slot}", "mesh": mesh, **{key: value.tolist() for key, value in now.items()}}
+        nodes.append(builder.append("nodes", node))
+        if len(starts) > 1:
+            for path, values in (("translation", starts[:, slot]), ("rotation", turn), ("scale", sizes[:, slot])):
+                builder.animate(nodes[-1], path, times, values, "STEP")
+    return nodes
+
+
+def _material(color: Color, opacity: float, two_sided: bool) -> dict[str, Any]:
+    linear = [float(c) for c in np.asarray(color) ** 2.2]  # glTF's factors are not gamma-coded
+    surface = {"baseColorFactor": [*linear, opacity], "metallicFactor": 0.0, "roughnessFactor": 0.6}
+    mode = {} if opacity == 1.0 else {"alphaMode": "BLEND"}
+    return {"pbrMetallicRoughness": surface, "doubleSided": two_sided, **mode}
 
 
 def _normals(vertices: FloatArray, faces: NDArray[Any]) -> FloatArray:

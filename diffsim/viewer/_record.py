@@ -10,11 +10,13 @@ import numpy as np
 
 from .._arguments import positive
 from .._check import check_count
+from .._inputs import Controls
 from .._progress import progress_bar
 from ..simulator import Simulator
 from ..state import State
 from ._draw import Camera
 from ._film import write_film
+from ._forces import with_forces
 from ._gltf import write_glb
 from ._html import html_page, make_plot
 from ._recording import IntArray, as_trajectory, make_recording
@@ -36,6 +38,9 @@ def record(
     fps: float | None = None,
     colors: Mapping[Any, Sequence[float]] | None = None,
     camera: Camera | None = None,
+    contacts: bool = False,
+    controls: Controls = None,
+    force_scale: float | None = None,
     size: tuple[int, int] = (800, 500),
     progress: bool | None = None,
 ) -> Path:
@@ -59,6 +64,15 @@ def record(
             its own (.rrd).
         colors: Red, green and blue from 0 to 1 by name or handle, of objects that shall not have the default colour.
         camera: Where a film is seen from, and a page at first. Default: `Camera()`.
+        contacts: Whether to show contact forces: an arrow from where a contact pushes, for each object that can move.
+            In a frame they are those of the step that ended there, which is taken again by `sim.contacts`; before the
+            first state nothing is known, and it shows those of the step from it. Objects become half transparent;
+            films draw arrows over everything instead.
+        controls: What drove the steps, if anything did: one Control that was held, or a sequence or leading axis of
+            them, with one for each state (what `rollout` was given for the trajectory it returned) or for each step
+            between two states. Only contacts ask for it.
+        force_scale: Length of an arrow by its force [m/N]. Default: as fits the scene; impacts, whose force is large,
+            are cut at half its size.
         size: Of a film [pixels].
         progress: Whether to show a bar. Default: for films of more than 50 frames.
     Returns: The path.
@@ -77,6 +91,8 @@ def record(
     if not film:
         frames = np.unique(frames)
     recording = make_recording(where, sim, states, frames, colors)
+    if contacts:
+        recording = with_forces(where, recording, sim, states, frames, controls, force_scale)
     camera = camera or Camera()
     path.parent.mkdir(parents=True, exist_ok=True)
     if film:
@@ -100,6 +116,9 @@ def show(
     speed: float = 1.0,
     colors: Mapping[Any, Sequence[float]] | None = None,
     camera: Camera | None = None,
+    contacts: bool = False,
+    controls: Controls = None,
+    force_scale: float | None = None,
     height: int = 420,
 ) -> Any:
     """Show a trajectory in a notebook, to play and to turn around.
@@ -110,6 +129,9 @@ def show(
         speed: As for `record`.
         colors: As for `record`.
         camera: As for `record`.
+        contacts: As for `record`.
+        controls: As for `record`.
+        force_scale: As for `record`.
         height: Of the picture [pixels].
     Returns: An object that a notebook displays when it is the last of a cell.
     Raises: As `record`.
@@ -118,6 +140,8 @@ def show(
     states = as_trajectory(where, sim, trajectory)
     frames = np.unique(_frames(states.leading_shape[0], sim.dt * _TURNABLE_FPS / speed))
     recording = make_recording(where, sim, states, frames, colors)
+    if contacts:
+        recording = with_forces(where, recording, sim, states, frames, controls, force_scale)
     return make_plot(recording, camera or Camera(), speed, height, where)
 
 

@@ -21,6 +21,8 @@ Color = tuple[float, float, float]
 _CLOTH: Color = (0.50, 0.66, 0.80)
 _STILL: Color = (0.72, 0.72, 0.75)  # static and kinematic bodies
 _GROUND: Color = (0.95, 0.95, 0.97)
+ARROWS: Color = (0.75, 0.08, 0.35)
+_SEEN_THROUGH = 0.5
 _BODIES: tuple[Color, ...] = (
     (0.93, 0.55, 0.25),
     (0.36, 0.60, 0.42),
@@ -54,13 +56,22 @@ class Part:
 
 
 @dataclass(frozen=True)
+class Arrows:
+    """The contact forces in one frame: an arrow for each push on an object that can move."""
+
+    starts: FloatArray  #: world, shape (k, 3) [m]
+    vectors: FloatArray  #: as long as they are drawn, shape (k, 3) [m]
+
+
+@dataclass(frozen=True)
 class Recording:
     """All objects of a scene over some frames of a trajectory."""
 
     times: FloatArray  #: of the frames, the first state's being 0, shape (frames,) [s]
     parts: list[Part]
     ground: Part | None
-    bounds: FloatArray  #: lowest and highest corner of the box all parts stay in, shape (2, 3) [m]
+    bounds: FloatArray  #: lowest and highest corner of the box all parts and arrows stay in, shape (2, 3) [m]
+    arrows: list[Arrows] | None = None  #: of each frame; None: nobody asked for them
 
     @property
     def centre(self) -> FloatArray:
@@ -71,6 +82,20 @@ class Recording:
     def size(self) -> float:
         """Diagonal of the box [m]."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    @property
+    def opacity(self) -> float:
+        """Of objects: arrows begin at their surfaces and go into them."""
+        return 1.0 if self.arrows is None else _SEEN_THROUGH
+
+    def arrows_in_slots(self) -> tuple[FloatArray, FloatArray]:
+        """Starts and vectors of shape (frames, n, 3) for the most arrows of a frame; zero where there are fewer."""
+        arrows = self.arrows or []
+        starts = np.zeros((len(arrows), max((len(a.starts) for a in arrows), default=0), 3))
+        vectors = np.zeros_like(starts)
+        for frame, a in enumerate(arrows):
+            starts[frame, : len(a.starts)], vectors[frame, : len(a.starts)] = a.starts, a.vectors
+        return starts, vectors
 
 
 def as_trajectory(where: str, sim: Simulator, trajectory: State | Sequence[State]) -> State:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._extras import require
-from ._recording import FloatArray, Part, Recording
+from ._recording import ARROWS, FloatArray, Part, Recording
 
 
 def write_rrd(recording: Recording, path: Path) -> None:
@@ -20,21 +20,25 @@ def write_rrd(recording: Recording, path: Path) -> None:
     parts = [*recording.parts, *([] if recording.ground is None else [recording.ground])]
     for part in parts:
         if part.nodes is None:
-            stream.log(f"world/{part.name}", _mesh(rerun, part, part.vertices), static=True)
+            stream.log(f"world/{part.name}", _mesh(rerun, part, part.vertices, recording.opacity), static=True)
     for index, time in enumerate(recording.times):
         stream.set_time("time", duration=float(time))
         for part in parts:
             if part.nodes is not None:
-                stream.log(f"world/{part.name}", _mesh(rerun, part, part.nodes[index]))
+                stream.log(f"world/{part.name}", _mesh(rerun, part, part.nodes[index], recording.opacity))
             elif part.poses is not None:
                 pose = part.poses[index]
                 stream.log(f"world/{part.name}", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        if recording.arrows is not None:
+            arrows, color = recording.arrows[index], [round(255.0 * c) for c in ARROWS]
+            drawn = rerun.Arrows3D(origins=arrows.starts, vectors=arrows.vectors, colors=color)
+            stream.log("world/contact_forces", drawn)
     stream.flush()
     stream.disconnect()
 
 
-def _mesh(rerun: Any, part: Part, vertices: FloatArray) -> Any:
-    color = [round(255.0 * c) for c in part.color]
+def _mesh(rerun: Any, part: Part, vertices: FloatArray, opacity: float) -> Any:
+    color = [round(255.0 * c) for c in (*part.color, opacity)]
     return rerun.Mesh3D(
         vertex_positions=vertices.astype(np.float32),
         triangle_indices=part.faces.astype(np.uint32),

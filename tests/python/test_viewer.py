@@ -15,6 +15,7 @@ import pytest
 import torch
 
 import diffsim as ds
+from diffsim.viewer._forces import with_forces
 from diffsim.viewer._recording import make_recording
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -88,10 +89,30 @@ def test_a_missing_package_is_named_with_the_command_that_mends_it(
 @BROWSER
 def test_page_plays_without_network(fall: tuple[ds.Simulator, ds.State], tmp_path: Path) -> None:
     pytest.importorskip("k3d", reason="pip install 'mesh-diffsim[viewer]'")
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     sim, trajectory = fall
-    page_path = ds.viewer.record(sim, trajectory, tmp_path / "fall.html", colors={"box": (1.0, 0.0, 0.0)})
-    assert page_path.stat().st_size < 2_000_000
+    page = ds.viewer.record(sim, trajectory, tmp_path / "fall.html", colors={"box": (1.0, 0.0, 0.0)})
+    assert page.stat().st_size < 2_000_000
+    pictures, controls = shots(page, (0.0, 0.36))
+    assert "time" in controls and "Play loop" in controls
+    rows = [np.argwhere((p[..., 0] > 2 * p[..., 1]) & (p[..., 0] > 60))[:, 0] for p in pictures]  # of the red box
+    assert min(len(r) for r in rows) > 100
+    assert np.mean(rows[1]) > np.mean(rows[0]) + 20  # it fell
+
+
+@BROWSER
+def test_page_shows_contact_forces(fall: tuple[ds.Simulator, ds.State], tmp_path: Path) -> None:
+    pytest.importorskip("k3d", reason="pip install 'mesh-diffsim[viewer]'")
+    sim, trajectory = fall
+    page = ds.viewer.record(sim, trajectory, tmp_path / "fall.html", contacts=True)
+    pictures, _ = shots(page, (0.0, 0.36))  # in the air, and on the ground
+    crimson = [((p[..., 0] > 2 * p[..., 1]) & (p[..., 0] > p[..., 2] + 30)).sum() for p in pictures]
+    assert crimson[0] == 0
+    assert crimson[1] > 30
+
+
+def shots(page_path: Path, times: tuple[float, ...]) -> tuple[list[np.ndarray], str]:
+    """What a page shows at these times, and the text of its controls; fails if it asks the network for anything."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     asked: list[str] = []
     wrong: list[str] = []
     with playwright.sync_playwright() as p:
@@ -103,7 +124,7 @@ def test_page_plays_without_network(fall: tuple[ds.Simulator, ds.State], tmp_pat
         page.goto(page_path.as_uri())
         page.wait_for_function("K3DInstance && 'then' in K3DInstance")
         pictures = []
-        for time in (0.0, 0.36):
+        for time in times:
             # Three frames of the browser: one may be on its way when the time is set.
             page.evaluate(
                 """(time) => K3DInstance.then((plot) => { plot.stopAutoPlay(); return plot.setTime(time); })
@@ -117,10 +138,7 @@ def test_page_plays_without_network(fall: tuple[ds.Simulator, ds.State], tmp_pat
         browser.close()
     assert not wrong
     assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
-    assert "time" in controls and "Play loop" in controls
-    rows = [np.argwhere((p[..., 0] > 2 * p[..., 1]) & (p[..., 0] > 60))[:, 0] for p in pictures]  # of the red box
-    assert min(len(r) for r in rows) > 100
-    assert np.mean(rows[1]) > np.mean(rows[0]) + 20  # it fell
+    return pictures, controls
 
 
 def pixels(png: bytes) -> np.ndarray:
@@ -237,3 +255,113 @@ def test_picture_shows_float32_states(fall: tuple[ds.Simulator, ds.State]) -> No
     figure = ds.viewer.picture(sim, trajectory[-1].to(torch.float32))
     assert len(figure.axes[0].collections) == 5  # four shadows, and what casts them
     assert pixels(figure._repr_png_()).std() > 10  # as notebooks show it
+
+
+# ---- contact forces --------------------------------------------------------------------------------------------------
+
+STEPS, MASS, GRAVITY = 5, 2.0, 9.81
+
+
+@pytest.fixture(scope="module")
+def pushed() -> tuple[ds.Simulator, ds.State, ds.Control]:
+    """Two boxes on each other and on a static one; the upper one is pushed down, harder in every step."""
+    scene = ds.Scene()
+    for name, height, mass in (("table", 0.0, None), ("lower", 0.201, MASS), ("upper", 0.402, MASS)):
+        kind = "static" if mass is None else "dynamic"
+        scene.add_body(ds.shapes.box(0.2), mass=mass, kind=kind, position=(0.0, 0.0, height), name=name)
+    sim = ds.Simulator(scene, dt=0.01)
+    rest = sim.rollout(sim.initial_state(), steps=50)[-1]
+    force = torch.zeros(STEPS, 3, 3, dtype=torch.float64)
+    force[:, 2, 2] = -10.0 * torch.arange(STEPS)
+    controls = ds.Control(force=force)
+    return sim, sim.rollout(rest, controls, STEPS), controls
+
+
+def record_forces(pushed: Any, frames: list[int], controls: Any, scale: float | None = 1.0) -> list[Any]:
+    sim, trajectory, _ = pushed
+    recording = make_recording("test", sim, trajectory, frames)
+    arrows = with_forces("test", recording, sim, trajectory, np.array(frames), controls, scale).arrows
+    assert arrows is not None
+    return arrows
+
+
+def test_arrows_are_the_forces_of_the_step_that_ended_there(pushed: tuple[ds.Simulator, ds.State, ds.Control]) -> None:
+    sim, _, controls = pushed
+    before = sim.info
+    frames = [0, 1, 4]
+    for given in (controls, list(controls), list(controls)[1:]):
+        for frame, arrows in zip(frames, record_forces(pushed, frames, given), strict=True):
+            push = 10.0 * max(frame, 1)  # of the first state's own step nothing is known
+            weight = 2.0 * MASS * GRAVITY + push  # from the table on the lower box; no arrow on the table
+            np.testing.assert_allclose(arrows.vectors.sum(axis=0), [0.0, 0.0, weight], atol=1e-2 * weight)
+            between = MASS * GRAVITY + push  # on both boxes
+            lengths = np.linalg.norm(arrows.vectors, axis=1).sum()
+            np.testing.assert_allclose(lengths, weight + 2.0 * between, rtol=1e-2)
+            assert np.isclose(arrows.starts[:, 2], 0.1, atol=1e-2).any()
+    assert sim.info is before
+    held = record_forces(pushed, [4], controls[4])
+    np.testing.assert_allclose(held[0].vectors, record_forces(pushed, [4], controls)[0].vectors)
+
+
+def test_arrows_fit_the_scene_where_nobody_says_how_long(pushed: tuple[ds.Simulator, ds.State, ds.Control]) -> None:
+    sim, trajectory, controls = pushed
+    size = make_recording("test", sim, trajectory).size
+    lengths = [np.linalg.norm(a.vectors, axis=1).max() for a in record_forces(pushed, [0, 2, 4], controls, None)]
+    assert 0.1 * size < max(lengths) <= 0.5 * size
+
+
+def test_controls_that_do_not_fit_the_states_are_refused(pushed: tuple[ds.Simulator, ds.State, ds.Control]) -> None:
+    sim, trajectory, controls = pushed
+    with pytest.raises(ValueError, match=r"record: controls must have an entry for each of the 5 states.*got 3"):
+        ds.viewer.record(sim, trajectory, "a.glb", contacts=True, controls=controls[:3])
+    with pytest.raises(ValueError, match=r"picture: force_scale must be positive"):
+        ds.viewer.picture(sim, trajectory, contacts=True, force_scale=0.0)
+
+
+def test_gltf_has_an_arrow_for_every_force(pushed: tuple[ds.Simulator, ds.State, ds.Control], tmp_path: Path) -> None:
+    sim, trajectory, controls = pushed
+    path = ds.viewer.record(
+        sim, trajectory, tmp_path / "a.glb", fps=100, contacts=True, controls=controls, force_scale=1e-2
+    )
+    document, arrays = gltf(path)
+    (animation,) = document["animations"]
+    total = np.zeros((STEPS, 3))
+    for index, node in enumerate(document["nodes"]):
+        if node["name"].startswith("contact force"):
+            tracks = {
+                c["target"]["path"]: animation["samplers"][c["sampler"]]
+                for c in animation["channels"]
+                if c["target"]["node"] == index
+            }
+            assert {track["interpolation"] for track in tracks.values()} == {"STEP"}
+            turns, sizes = (arrays[tracks[name]["output"]] for name in ("rotation", "scale"))
+            matrices = ds.rotation.to_matrix(torch.from_numpy(turns[:, [3, 0, 1, 2]].astype(np.float64))).numpy()
+            total += matrices[:, :, 2] * sizes[:, 2:]
+    weights = 2.0 * MASS * GRAVITY + 10.0 * np.array([1, 1, 2, 3, 4])
+    np.testing.assert_allclose(total[:, 2], 1e-2 * weights, rtol=1e-2)
+    assert all(material["alphaMode"] == "BLEND" for material in document["materials"][:-1])  # the last is the arrows'
+
+
+def test_rerun_recording_has_contact_forces(pushed: tuple[ds.Simulator, ds.State, ds.Control], tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="pip install 'mesh-diffsim[rerun]'")
+    sim, trajectory, controls = pushed
+    raw = ds.viewer.record(sim, trajectory, tmp_path / "a.rrd", contacts=True, controls=controls).read_bytes()
+    assert b"world/contact_forces" in raw
+
+
+def test_pictures_and_films_show_contact_forces(
+    pushed: tuple[ds.Simulator, ds.State, ds.Control], tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib", reason="pip install 'mesh-diffsim[viewer]'")
+    image = pytest.importorskip("PIL.Image", reason="pip install 'mesh-diffsim[viewer]'")
+    sim, trajectory, controls = pushed
+
+    def crimson(shot: np.ndarray) -> int:
+        return int(((shot[..., 0] > 2 * shot[..., 1]) & (shot[..., 0] > 100) & (shot[..., 2] > shot[..., 1])).sum())
+
+    for contacts in (False, True):
+        path = tmp_path / "a.webp"
+        ds.viewer.record(sim, trajectory, path, size=(320, 240), contacts=contacts, controls=controls)
+        assert (crimson(np.asarray(image.open(path).convert("RGB")).astype(int)) > 10) == contacts
+        figure = ds.viewer.picture(sim, trajectory, count=2, contacts=contacts, controls=controls)
+        assert (crimson(pixels(figure._repr_png_())) > 50) == contacts
