@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from . import diagnostics, parameters, rotation, shapes, viewer
+from . import parameters, rotation, shapes
 from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
 from ._units import UnitsWarning
 from .contacts import Contacts
@@ -29,6 +29,7 @@ __all__ = [
     "State",
     "UnitsWarning",
     "diagnostics",
+    "interop",
     "parameters",
     "rotation",
     "shapes",
@@ -37,14 +38,22 @@ __all__ = [
 
 
 if TYPE_CHECKING:
+    from . import diagnostics as diagnostics
     from . import interop as interop
+    from . import viewer as viewer
+
+_LOADED_WHEN_USED = ("diagnostics", "interop", "viewer")
 
 
 def __getattr__(name: str) -> Any:
-    if name == "interop":
-        return import_module(".interop", __name__)
+    if name in _LOADED_WHEN_USED:
+        return import_module(f".{name}", __name__)
     if name == "__version__":
         from importlib.metadata import version
 
         return version("mesh-diffsim")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -15,7 +15,7 @@ from ._volume import require_solid
 _NO_MASS = "{where}: a dynamic body needs density= [kg/m³] or mass= [kg]; or give kind='static'"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shape:
     """Geometry in the frame of the mesh as given."""
 

@@ -19,7 +19,7 @@ from ._packed import PackedScene
 _LEAST_WARP_SINE = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClothElements:
     """Nodes, triangles and hinges of all cloths of a scene, and which cloth each belongs to."""
 

@@ -25,7 +25,7 @@ _CELLS_A_BOX = 16  # that a triangle covers on average at most, while looking fo
 Indices = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ClothShape:
     """Geometry in the frame of the mesh as given: node i is vertex i."""
 

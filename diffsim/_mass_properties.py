@@ -14,7 +14,7 @@ IntArray = NDArray[np.int32]
 _ROUNDING = 16.0 * np.finfo(np.float64).eps  # relative, of sums over faces
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MassProperties:
     """Of a solid of density 1 kg/m³; all three scale linearly with the density."""
 

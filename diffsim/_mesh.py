@@ -23,7 +23,7 @@ _FLAT_VOLUME = 1e-12
 _CLOSED_MEND = "remove such faces (trimesh: mesh.update_faces(mesh.nondegenerate_faces())) and close the mesh again"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EdgeDefects:
     """What keeps a mesh from enclosing a volume."""
 

@@ -25,7 +25,7 @@ _HEIGHT_FRACTION = 0.1
 _FLAT = 1e-6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class PackedScene:
     """A scene as arrays, its n bodies and c cloths in the order they were added.
 
@@ -74,7 +74,7 @@ class PackedScene:
     object_thickness: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     name: str
     kind: Kind
@@ -87,7 +87,7 @@ class Body:
     restitution: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cloth:
     name: str
     shape: ClothShape

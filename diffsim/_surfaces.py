@@ -27,7 +27,7 @@ _MAX_FACE_PAIRS = 200_000
 _MOST_CONVEX_FACES = 1000  # of a mesh that is tested for being convex
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solid:
     """A body or a cloth placed in the world: the points within `radius` of its mesh, segment or point, and what it
     encloses.
@@ -189,7 +189,7 @@ def meeting_faces(a: Solid, b: Solid) -> NDArray[np.int64]:
     return np.stack([key // len(b.faces), key % len(b.faces)], axis=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Crossing:
     """Pairs of triangles, and whether they properly cross: along a piece of line, each reaching through the other."""
 

@@ -8,6 +8,7 @@ import pytest
 LAZY_MODULES = (
     *("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco", "gymnasium"),
     *("k3d", "imageio_ffmpeg", "PIL", "rerun"),
+    *("diffsim.diagnostics", "diffsim.interop", "diffsim.viewer"),
 )
 
 
@@ -39,3 +40,4 @@ def test_public_names_exist() -> None:
     assert diffsim.__all__
     missing = [name for name in diffsim.__all__ if not hasattr(diffsim, name)]
     assert not missing
+    assert set(diffsim.__all__) <= set(dir(diffsim))
