@@ -9,7 +9,6 @@ would need many more episodes than either gets here.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import time
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, save_figure
+from _stage import FloatArray, make_parser, save_figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -318,18 +317,10 @@ class Program:
         check: Callable[[Any, Distance, Learning, Learning | None], bool],
         draw_scene: Callable[[Any, Any, Learning], None],
     ) -> int:
-        parser = argparse.ArgumentParser(
-            description=self.description, formatter_class=argparse.RawDescriptionHelpFormatter
-        )
-        parser.add_argument("--seed", type=int, default=0, help="the first (default: %(default)s)")
+        quick = f"one seed, {self.quick_episodes} episodes, without DDPG"
+        parser = make_parser(self.description, quick, "the first")
         parser.add_argument("--seeds", type=int, default=self.seeds, help="how many (default: %(default)s)")
         parser.add_argument("--episodes", type=int, default=self.episodes, help="of each (default: %(default)s)")
-        quick = f"one seed, {self.quick_episodes} episodes, without DDPG"
-        parser.add_argument("--quick", action="store_true", help=quick)
-        parser.add_argument(
-            "--out", type=Path, default=Path("out"), help="folder for the results (default: %(default)s)"
-        )
-        parser.add_argument("--no-picture", action="store_true")
         options = parser.parse_args(argv)
         begin = time.perf_counter()
         task, left = build_task()

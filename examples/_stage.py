@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,24 @@ def load_figure(path: str | None, faces: int, size: float) -> Any:
     return mesh
 
 
+# ---- programs --------------------------------------------------------------------------------------------------------
+
+
+def make_parser(description: str | None, quick: str, seed: str) -> argparse.ArgumentParser:
+    """What every example can be told. `quick`: what it then does; `seed`: what that changes."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0, help=f"{seed} (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results (default: %(default)s)")
+    parser.add_argument("--no-picture", action="store_true")
+    return parser
+
+
+def shift(seed: int, size: float) -> float:
+    """A change of a start, at most so large, for an example in which nothing is random; none for seed 0."""
+    return float(np.random.default_rng(seed).uniform(-size, size)) if seed else 0.0
+
+
 # ---- checks ----------------------------------------------------------------------------------------------------------
 
 
@@ -55,6 +74,30 @@ def report(results: Iterable[tuple[str, bool]]) -> bool:
         print(f"{'ok  ' if holds else 'FAIL'}  {text}")
         passed = passed and holds
     return passed
+
+
+def weight_errors(
+    sim: ds.Simulator, states: Sequence[ds.State], drives: Mapping[int, ds.Control], masses: Mapping[int, float]
+) -> dict[int, float]:
+    """Of bodies over some steps: the impulse of their contacts less that of gravity less the momentum they gained, over
+    their weight's impulse.
+
+    Args:
+        sim: What stepped the states.
+        states: All of them.
+        drives: What drove steps that follow each other, by the number of the state they were taken from.
+        masses: Of those bodies [kg]; not the simulator's, which is what is judged.
+    """
+    first, last = min(drives), max(drives) + 1
+    impulse = torch.zeros(len(sim.body_names), 3, dtype=torch.float64)
+    for step, control in drives.items():
+        impulse += sim.dt * sim.contacts(states[step], control).net_force()
+    errors = {}
+    for body, mass in masses.items():
+        weight = torch.tensor([0.0, 0.0, mass * 9.81 * sim.dt * len(drives)], dtype=torch.float64)
+        gained = mass * (states[last].velocity[body] - states[first].velocity[body])
+        errors[body] = float((impulse[body] - weight - gained).norm() / weight.norm())
+    return errors
 
 
 class Judge:

@@ -21,7 +21,6 @@ Writes out/estimate_mass.png and .json and checks itself: the exit code says whe
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
@@ -33,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _stage import report, save_figure
+from _stage import make_parser, report, save_figure
 from scipy import stats
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
@@ -311,12 +310,9 @@ def draw(descent: Descent, recording: Recording, main: Fit, coverage: Coverage, 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    quick = f"{QUICK_DRAWS} draws of noise instead of {DRAWS}"
+    parser = make_parser(__doc__, quick, "of the noise")
     parser.add_argument("--speed", type=float, default=1.0, help="v of the cubes [m/s] (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_DRAWS} draws of noise instead of {DRAWS}")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     descent = descend(options.speed)

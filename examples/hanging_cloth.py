@@ -16,7 +16,6 @@ shape is judged by the elastica: stiffnesses read off it by the balance of force
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 import time
@@ -28,7 +27,7 @@ from typing import Any
 import cma  # type: ignore[import-untyped]
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, report, save_figure
+from _stage import FloatArray, Judge, make_parser, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -318,19 +317,17 @@ def draw(problem: Problem, searches: Sequence[Search], path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "the same: it takes seconds", "of the noise, and of CMA-ES")
     parser.add_argument("--budget", type=int, default=BUDGET, help="simulations of each method (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     budget = options.budget
     strip = Strip()
-    problem = observe(strip, TRUTH)
+    problem = observe(strip, TRUTH, options.seed)
     print(f"{NODES[0]} x {NODES[1]} nodes, {STEPS} steps of {DT:g} s; {budget} simulations for each method")
     with tqdm(total=2 * budget, desc="simulations", unit="run") as bar:
         gradient = by_gradient(problem, budget, bar.update)
-        evolution = by_cma(problem, budget, bar.update)
+        evolution = by_cma(problem, budget, bar.update, options.seed + 1)
     for search in (gradient, evolution):
         stretch, bend = search.values
         count = len(search.losses)

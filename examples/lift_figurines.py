@@ -10,7 +10,7 @@ Writes out/lift_figurines.png and checks itself: the exit code says whether all 
 
 from __future__ import annotations
 
-import argparse
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from _stage import FloatArray, Judge, load_figure, report, save_figure
+from _stage import FloatArray, Judge, load_figure, make_parser, report, save_figure, shift, weight_errors
 from torch import Tensor
 from tqdm import tqdm
 
@@ -42,6 +42,7 @@ LIFTED = 0.05  # how far a figurine's lowest point is off the ground at the end,
 COVERED = 0.8  # of the directions from a figurine's centre of mass that meet the cloth, at least; 0.5 at the start
 BELOW = 0.98  # the same for the lower half of them, at least
 DIRECTIONS = 400
+LAST, BALANCE = 10, 1e-3  # steps at the end over which forces are added up; what they may be off, relative
 
 
 # ---- the scene, and its run ------------------------------------------------------------------------------------------
@@ -67,12 +68,14 @@ def corners(nodes: int) -> list[int]:
     return [0, nodes - 1, nodes * (nodes - 1), nodes * nodes - 1]
 
 
-def build_scene(meshes: Sequence[Any], nodes: int) -> ds.Scene:
+def build_scene(meshes: Sequence[Any], nodes: int, turned: float = 0.0) -> ds.Scene:
+    """The figurines, turned about the vertical by an angle [rad], on the cloth on the ground."""
     scene = ds.Scene()
     scene.add_ground()
     for i, (mesh, name) in enumerate(zip(meshes, ("bunny", "pawn"))):
         place = ((i - 0.5) * APART, 0.0, 2.0 * THICKNESS)
-        scene.add_body((mesh.vertices, mesh.faces), density=DENSITY, position=place, name=name)
+        facing = ds.rotation.from_rpy(np.array([0.0, 0.0, turned]))
+        scene.add_body((mesh.vertices, mesh.faces), density=DENSITY, position=place, orientation=facing, name=name)
     sheet = ds.shapes.sheet(SIDE, nodes)
     scene.add_cloth(sheet, MATERIAL, pinned=corners(nodes), position=(0.0, 0.0, THICKNESS), name="cloth")
     return scene
@@ -105,8 +108,8 @@ class Run:
     seconds: float
 
 
-def lift(meshes: Sequence[Any], nodes: int = NODES, dt: float = DT, quiet: bool = False) -> Run:
-    scene = build_scene(meshes, nodes)
+def lift(meshes: Sequence[Any], nodes: int = NODES, dt: float = DT, turned: float = 0.0, quiet: bool = False) -> Run:
+    scene = build_scene(meshes, nodes, turned)
     sim = ds.Simulator(scene, dt=dt, thickness=THICKNESS)
     states, failed, pinned = [sim.initial_state()], [], corners(nodes)
     begin = time.perf_counter()
@@ -172,6 +175,12 @@ def check(run: Run) -> bool:
         if not meets(state.position[body].numpy(), down, np.asarray(run.sim.mesh(state, cloth).triangles)).all()
     ]
     results.append(("cloth is under both all the time" + "".join(f"; not {f}" for f in fallen[:3]), not fallen))
+    masses = {body: DENSITY * float(run.sim.mesh(first, body).volume) for body in range(cloth)}
+    steps = range(len(run.states) - 1 - LAST, len(run.states) - 1)
+    drives = {step: drive(first.node_position, run.pinned, step, run.sim.dt) for step in steps}
+    for body, off in weight_errors(run.sim, run.states, drives, masses).items():
+        text = f"{run.sim.body_names[body]}: in the last {LAST} steps the cloth carries its weight, to {off:.1e}"
+        results.append((text, off < BALANCE))
     # At rest in the end, or nearly: the bag swings.
     weight = run.sim.mass.sum() * 9.81
     swing = float(run.sim.kinetic_energy(last)) / float(weight * RISE)
@@ -207,18 +216,15 @@ def draw(run: Run, path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "13 x 13 nodes, steps of 0.02 s", "of where the figurines look, to 10 degrees")
     parser.add_argument("--mesh", action="append", default=[], help="instead of the bunny; a second one: of the pawn")
     parser.add_argument("--nodes", type=int, default=NODES, help="of the cloth along a side (default: %(default)s)")
     parser.add_argument("--dt", type=float, default=DT, help="time step [s] (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="13 x 13 nodes, steps of 0.02 s")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     meshes = figurines(options.mesh)
     nodes, dt = (13, 0.02) if options.quick else (options.nodes, options.dt)
-    run = lift(meshes, nodes, dt)
+    run = lift(meshes, nodes, dt, shift(options.seed, math.radians(10.0)))
     masses = " and ".join(f"{mass:.2f} kg" for mass in run.sim.mass.tolist())
     each = 1e3 * run.seconds / (len(run.states) - 1)
     print(f"{masses} on {nodes} x {nodes} nodes; {each:.0f} ms per step of {dt:g} s")

@@ -14,7 +14,6 @@ Writes out/marble_inverse.png and checks itself: the exit code says whether all 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 import sys
@@ -28,7 +27,7 @@ from typing import Any
 import cma  # type: ignore[import-untyped]
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, report, save_figure
+from _stage import FloatArray, Judge, make_parser, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -302,13 +301,9 @@ def curve(axes: Any, searches: Sequence[Search], color: str, over_seconds: bool)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=0, help="of the first target (default: %(default)s)")
+    parser = make_parser(__doc__, "two targets, and a tenth of CMA-ES's simulations", "of the first target")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="how many targets (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=ITERATIONS, help="of descent (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="two targets, and a tenth of CMA-ES's simulations")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     seeds, times = (min(options.seeds, 2), TIMES // 10) if options.quick else (options.seeds, TIMES)

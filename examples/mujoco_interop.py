@@ -17,7 +17,6 @@ Writes out/mujoco_interop.png and .json and checks itself: the exit code says wh
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -29,7 +28,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from _stage import FloatArray, report, save_figure
+from _stage import FloatArray, make_parser, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -229,12 +228,8 @@ def draw(task: Task, search: Search, path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=0, help="of where the cubes shall meet (default: %(default)s)")
+    parser = make_parser(__doc__, "the same: it takes seconds", "of where the cubes shall meet")
     parser.add_argument("--steps", type=int, default=GRADIENT_STEPS, help="gradient steps (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="the same: it takes seconds")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     task = Task(options.seed)

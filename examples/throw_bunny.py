@@ -15,7 +15,6 @@ Writes out/throw_bunny.png and checks itself: the exit code says whether all tha
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import time
@@ -28,7 +27,7 @@ import fcl
 import numpy as np
 import torch
 import trimesh
-from _stage import FloatArray, load_figure, report, save_figure
+from _stage import FloatArray, load_figure, make_parser, report, save_figure, shift
 from torch import Tensor
 from tqdm import tqdm
 
@@ -129,8 +128,9 @@ class Search:
     losses: list[float] = field(default_factory=list)
 
 
-def optimise(throw: Throw, iterations: int, quiet: bool = False) -> Search:
-    velocity = torch.tensor(LAUNCH, dtype=torch.float64, requires_grad=True)
+def optimise(throw: Throw, iterations: int, seed: int = 0, quiet: bool = False) -> Search:
+    launch = [speed + shift(3 * seed + k, 0.01) if seed else speed for k, speed in enumerate(LAUNCH)]
+    velocity = torch.tensor(launch, dtype=torch.float64, requires_grad=True)
     spin = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([{"params": [velocity]}, {"params": [spin]}], betas=(0.7, 0.95))
     rates = [VELOCITY_RATE, SPIN_RATE]
@@ -140,8 +140,13 @@ def optimise(throw: Throw, iterations: int, quiet: bool = False) -> Search:
             trajectory = throw(velocity, spin)
             loss = throw.miss(trajectory).square().sum()
             assert throw.sim.info is not None
-            launch = (velocity.detach().clone(), spin.detach().clone())
-            shot = Shot(*launch, trajectory.detach(), loss.item(), throw.sim.info.failed_steps)
+            shot = Shot(
+                velocity.detach().clone(),
+                spin.detach().clone(),
+                trajectory.detach(),
+                loss.item(),
+                throw.sim.info.failed_steps,
+            )
             if search is None:
                 search = Search(shot, shot)
             if shot.loss < search.best.loss:
@@ -341,11 +346,9 @@ def draw(throw: Throw, search: Search, path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "the same: it takes seconds", "of the first launch, to 10 mm/s")
     parser.add_argument("--mesh", help="any file trimesh can read, instead of the bunny")
     parser.add_argument("--iterations", type=int, default=60, help="throws at most (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     try:
@@ -354,7 +357,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--mesh: {error}")
     throw = Throw(mesh)
     print(f"{len(mesh.faces)} faces, {float(throw.sim.mass[throw.bunny]):.3f} kg; {STEPS} steps of {DT:g} s")
-    search = optimise(throw, options.iterations)
+    search = optimise(throw, options.iterations, options.seed)
     for name, shot in (("first", search.first), ("best", search.best)):
         velocity, spin = ([round(x, 4) for x in t.tolist()] for t in (shot.velocity, shot.spin))
         print(f"{name} launch: velocity {velocity} m/s, spin {spin} rad/s, misses by {shot.millimetres:.1f} mm")

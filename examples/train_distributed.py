@@ -12,7 +12,6 @@ Writes out/train_distributed.png and checks itself: the exit code says whether a
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import sys
@@ -25,7 +24,7 @@ from typing import Any
 
 import torch
 import torch.distributed
-from _stage import report, save_figure
+from _stage import make_parser, report, save_figure
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -36,7 +35,7 @@ RADIUS, GAP = 0.05, 0.1  # of both balls; between them at first [m]
 SCENES = 32  # per iteration, over all processes
 TESTS = 64  # scenes no network was trained on
 NEAREST, FARTHEST, WIDEST = 0.3, 0.8, math.radians(25.0)  # where targets are, seen from the ball that is struck
-RATE, ITERATIONS = 0.01, 300
+RATE, ITERATIONS, QUICK_ITERATIONS = 0.01, 300, 150
 
 FALL = 100.0  # the mean squared distance must fall by this
 HIT = 0.95  # part of the test scenes in which the ball must have been struck
@@ -63,12 +62,17 @@ def targets(count: int, seed: int) -> Tensor:
     return torch.stack([distance * angle.cos(), distance * angle.sin()], dim=-1)
 
 
+def first_scenes(seed: int) -> int:
+    """The seed of the targets of the first iteration; the next follow."""
+    return 100_000 * seed
+
+
 class Policy(nn.Module):
     """From targets (B, 2) to where the ball is in the end (B, 2): network and physics."""
 
-    def __init__(self) -> None:
+    def __init__(self, seed: int = 0) -> None:
         super().__init__()
-        torch.manual_seed(0)  # the same in every process
+        torch.manual_seed(seed)  # the same in every process
         layers = nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 2)
         self.network = nn.Sequential(*layers).double()
         with torch.no_grad():
@@ -138,18 +142,19 @@ def gradient(policy: nn.Module) -> Tensor:
 class Training:
     policy: Policy
     share: Share
+    seed: int
     first_gradient: Tensor  # as the processes averaged it
     losses: list[float] = field(default_factory=list)  # mean over all scenes
 
 
-def train(share: Share, iterations: int) -> Training:
-    policy = Policy()
+def train(share: Share, iterations: int, seed: int = 0) -> Training:
+    policy = Policy(seed)
     module: nn.Module = policy if share.count == 1 else DistributedDataParallel(policy)
     optimiser = torch.optim.Adam(policy.network.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
-    training = Training(policy, share, torch.empty(0))
+    training = Training(policy, share, seed, torch.empty(0))
     for iteration in range(iterations):
-        target = share.part(targets(SCENES, seed=iteration))
+        target = share.part(targets(SCENES, seed=first_scenes(seed) + iteration))
         optimiser.zero_grad()
         loss = squared_distance(module(target), target)
         loss.backward()
@@ -166,9 +171,9 @@ def train(share: Share, iterations: int) -> Training:
 # ---- checks ----------------------------------------------------------------------------------------------------------
 
 
-def reference_gradient() -> Tensor:
+def reference_gradient(seed: int) -> Tensor:
     """The first gradient by one process with all scenes."""
-    policy, target = Policy(), targets(SCENES, seed=0)
+    policy, target = Policy(seed), targets(SCENES, seed=first_scenes(seed))
     squared_distance(policy(target), target).backward()
     return gradient(policy)
 
@@ -184,11 +189,11 @@ def evaluate(policy: Policy) -> tuple[float, float]:
 def check(training: Training) -> bool:
     """True if all holds; every process has to call it."""
     share, policy = training.share, training.policy
-    expected = reference_gradient()
+    expected = reference_gradient(training.seed)
     error = float((training.first_gradient - expected).norm() / expected.norm())
     weights = torch.cat([p.detach().flatten() for p in policy.network.parameters()])
     spread = float((share.mean(weights) - weights).abs().max())
-    (before, _), (after, struck) = evaluate(Policy()), evaluate(policy)
+    (before, _), (after, struck) = evaluate(Policy(training.seed)), evaluate(policy)
     info = policy.sim.info
     assert info is not None
     holds = [
@@ -227,15 +232,15 @@ def draw(training: Training, path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    quick = f"{QUICK_ITERATIONS} iterations"
+    parser = make_parser(__doc__, quick, "of the network and its scenes")
     parser.add_argument("--iterations", type=int, default=ITERATIONS, help="of training (default: %(default)s)")
     parser.add_argument("--gradient", type=Path, help="file for the gradient of the first iteration (torch.save)")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     with processes() as share:
-        training = train(share, options.iterations)
+        iterations = min(options.iterations, QUICK_ITERATIONS) if options.quick else options.iterations
+        training = train(share, iterations, options.seed)
         if options.gradient is not None and share.rank == 0:
             torch.save(training.first_gradient, options.gradient)
         if not options.no_picture and share.rank == 0:

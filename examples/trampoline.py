@@ -17,7 +17,6 @@ Writes out/trampoline.png and checks itself: the exit code says whether all that
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import math
 import sys
@@ -28,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _stage import FloatArray, Judge, report, save_figure
+from _stage import FloatArray, Judge, make_parser, report, save_figure, shift
 from tqdm import tqdm
 
 import diffsim as ds
@@ -74,19 +73,26 @@ class Run:
     seconds: float
 
 
-def build_scene(nodes: int, speed: float) -> ds.Scene:
+def build_scene(nodes: int, speed: float, aside: float = ASIDE) -> ds.Scene:
     scene = ds.Scene(gravity=(0.0, 0.0, -GRAVITY))
     vertices, faces = ds.shapes.sheet(SIDE, nodes)
     rim = np.abs(vertices[:, :2]).max(axis=1) > 0.5 * SIDE * (1.0 - 1e-9)
     material = ds.ClothMaterial.isotropic(YOUNG, THICK, DENSITY, POISSON, DAMPING)
     scene.add_cloth((vertices, faces), material, pinned=rim, position=(0, 0, HEIGHT), margin=0.5 * THICK, name="sheet")
-    start = (ASIDE, ASIDE, HEIGHT + 0.5 * THICK + RADIUS + DROP)
+    start = (aside, aside, HEIGHT + 0.5 * THICK + RADIUS + DROP)
     scene.add_sphere(RADIUS, mass=MASS, position=start, velocity=(0.0, 0.0, -speed), name="ball")
     return scene
 
 
-def fall(nodes: int, dt: float = DT, speed: float = 0.0, duration: float = DURATION, quiet: bool = False) -> Run:
-    scene = build_scene(nodes, speed)
+def fall(
+    nodes: int,
+    dt: float = DT,
+    speed: float = 0.0,
+    aside: float = ASIDE,
+    duration: float = DURATION,
+    quiet: bool = False,
+) -> Run:
+    scene = build_scene(nodes, speed, aside)
     sim = ds.Simulator(scene, dt=dt)
     states, failed = [sim.initial_state()], []
     begin = time.perf_counter()
@@ -117,23 +123,24 @@ class Peer:
     step_milliseconds: float
 
 
-def world_xml(dt: float, sheet: str, extra: str = "") -> str:
+def world_xml(dt: float, aside: float, sheet: str, extra: str = "") -> str:
     # "discrete" integrates the stiffness of flexes and tendons implicitly.
     return (
         f'<mujoco><option timestep="{dt}" gravity="0 0 {-GRAVITY}" integrator="discrete"/>'
         f"<worldbody>{sheet}"
-        f'<body name="ball" pos="{ASIDE} {ASIDE} {HEIGHT + 0.5 * THICK + RADIUS + DROP}"><freejoint/>'
+        f'<body name="ball" pos="{aside} {aside} {HEIGHT + 0.5 * THICK + RADIUS + DROP}"><freejoint/>'
         f'<geom type="sphere" size="{RADIUS}" mass="{MASS}" contype="1" conaffinity="2" {FRICTIONLESS}/></body>'
         f"</worldbody>{extra}</mujoco>"
     )
 
 
-def flex_xml(nodes: int, dt: float) -> str:
+def flex_xml(nodes: int, dt: float, aside: float) -> str:
     spacing = SIDE / (nodes - 1)
     ends = (0, nodes - 1)
     rim = " ".join(str(i * nodes + j) for i in range(nodes) for j in range(nodes) if i in ends or j in ends)
     return world_xml(
         dt,
+        aside,
         f'<flexcomp name="sheet" type="grid" dim="2" count="{nodes} {nodes} 1" spacing="{spacing} {spacing} {spacing}"'
         f' pos="0 0 {HEIGHT}" radius="{0.5 * THICK}" mass="{DENSITY * THICK * SIDE**2}">'
         f'<elasticity young="{YOUNG}" poisson="{POISSON}" thickness="{THICK}" elastic2d="both" damping="{DAMPING}"/>'
@@ -141,7 +148,7 @@ def flex_xml(nodes: int, dt: float) -> str:
     )
 
 
-def net_xml(nodes: int, dt: float) -> str:
+def net_xml(nodes: int, dt: float, aside: float) -> str:
     spacing, stiffness = SIDE / (nodes - 1), YOUNG * THICK  # a spring for a strip as wide as it is long
     bodies, springs = [], []
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
@@ -160,7 +167,7 @@ def net_xml(nodes: int, dt: float) -> str:
                 for k, m in ((i + 1, j), (i, j + 1))
                 if k < nodes and m < nodes
             ]
-    return world_xml(dt, "".join(bodies), f"<tendon>{''.join(springs)}</tendon>")
+    return world_xml(dt, aside, "".join(bodies), f"<tendon>{''.join(springs)}</tendon>")
 
 
 def fall_in_mujoco(name: str, xml: str, dt: float, speed: float, duration: float) -> Peer:
@@ -183,14 +190,15 @@ def fall_in_mujoco(name: str, xml: str, dt: float, speed: float, duration: float
     return Peer(name, times, np.array(heights), 1e3 * seconds / (len(heights) - 1))
 
 
-def peers(nodes: int, dt: float, speed: float, duration: float) -> list[Peer]:
+def peers(nodes: int, dt: float, speed: float, duration: float, aside: float = ASIDE) -> list[Peer]:
     """The flex with a small step of its own, and the net with ours; none without mujoco."""
     if importlib.util.find_spec("mujoco") is None:
         print("mujoco is not installed: its ball is left out (pip install mujoco)")
         return []
+    flex, net = flex_xml(nodes, FLEX_DT, aside), net_xml(NET_NODES, dt, aside)
     return [
-        fall_in_mujoco(f"MuJoCo flex, {nodes} x {nodes}", flex_xml(nodes, FLEX_DT), FLEX_DT, speed, duration),
-        fall_in_mujoco(f"MuJoCo net, {NET_NODES} x {NET_NODES} spheres", net_xml(NET_NODES, dt), dt, speed, duration),
+        fall_in_mujoco(f"MuJoCo flex, {nodes} x {nodes}", flex, FLEX_DT, speed, duration),
+        fall_in_mujoco(f"MuJoCo net, {NET_NODES} x {NET_NODES} spheres", net, dt, speed, duration),
     ]
 
 
@@ -295,19 +303,17 @@ def draw(run: Run, others: Sequence[Peer], path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, "11 x 11 nodes", "of where the ball falls, to 5 mm")
     parser.add_argument("--nodes", type=int, default=NODES, help="of the sheet along a side (default: %(default)s)")
     parser.add_argument("--dt", type=float, default=DT, help="time step [s] (default: %(default)s)")
     parser.add_argument("--speed", type=float, default=0.0, help="downwards at the start [m/s] (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="11 x 11 nodes")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     nodes = 11 if options.quick else options.nodes
-    run = fall(nodes, options.dt, options.speed)
+    aside = ASIDE + shift(options.seed, 5e-3)
+    run = fall(nodes, options.dt, options.speed, aside)
     print(f"diffsim: {1e3 * run.seconds / (len(run.states) - 1):.1f} ms per step of {options.dt:g} s")
-    others = peers(nodes, options.dt, options.speed, DURATION)
+    others = peers(nodes, options.dt, options.speed, DURATION, aside)
     for peer in others:
         print(f"{peer.name}: {peer.step_milliseconds:.1f} ms per step of {peer.times[1]:g} s")
     if not options.no_picture:

@@ -100,10 +100,10 @@ def test_throw_bunny_says_in_a_line_that_there_is_no_such_mesh(
 @pytest.mark.parametrize(
     ("name", "arguments", "holds"),
     [
-        ("lift_figurines", ["--quick"], 9),
-        ("dominoes", [], 7),
+        ("lift_figurines", ["--quick"], 11),
+        ("dominoes", ["--quick"], 8),
         ("trampoline", ["--quick"], 7),
-        ("hanging_cloth", [], 10),
+        ("hanging_cloth", ["--quick"], 10),
         ("marble_inverse", ["--quick"], 7),
     ],
 )
@@ -147,6 +147,41 @@ def test_application_passes(name: str, holds: int, tmp_path: Path, capsys: pytes
     assert output.count("ok  ") == holds
     assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert (tmp_path / f"{name}.json").stat().st_size > 100
+
+
+def test_balance_ball_passes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("gymnasium", reason="pip install .[examples]")
+    assert load("balance_ball").main(["--quick", "--out", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "FAIL" not in output
+    assert output.count("ok  ") == 5
+    assert (tmp_path / "balance_ball.png").stat().st_size > 10_000
+    assert (tmp_path / "balance_ball.csv").read_text().startswith("algorithm,seed,steps")
+
+
+def test_balance_ball_plays_ppo(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("stable_baselines3", reason="pip install 'mesh-diffsim[rl]'")
+    module = load("balance_ball")
+    monkeypatch.setattr(module, "EPISODES", 2)
+    task = module.build_task()
+    curve = module.by_ppo(task, 0, 2 * module.STEPS)
+    assert curve.steps == [0, 2 * module.STEPS]
+    assert 0.0 < curve.held[-1] < module.SIDE
+
+
+EVERY = sorted(path.stem for path in EXAMPLES.glob("[a-z]*.py"))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_example_is_told_the_same(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for package in ("cma", "gymnasium", "mujoco", "scipy"):
+        pytest.importorskip(package, reason="pip install .[examples]")
+    module = load(name)
+    assert callable(module.check)
+    with pytest.raises(SystemExit):
+        module.main(["--help"])
+    told = capsys.readouterr().out
+    assert [option for option in ("--seed", "--quick", "--out", "--no-picture") if option not in told] == []
 
 
 def test_marble_inverse_fails_where_gradients_are_wrong(
