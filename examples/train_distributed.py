@@ -39,6 +39,7 @@ RATE, ITERATIONS, QUICK_ITERATIONS = 0.01, 300, 150
 
 FALL = 100.0  # the mean squared distance must fall by this
 HIT = 0.95  # part of the test scenes in which the ball must have been struck
+GRADIENT_ERROR = 1e-5  # against central differences, relative
 SAME_GRADIENT = 1e-10  # between one process with all scenes and several with a part each, relative
 
 
@@ -178,6 +179,23 @@ def reference_gradient(seed: int) -> Tensor:
     return gradient(policy)
 
 
+def gradient_error(seed: int) -> float:
+    """Of the first loss along a random direction of the weights, against central differences, relative."""
+    policy, target = Policy(seed), targets(SCENES, seed=first_scenes(seed))
+    weights = list(policy.network.parameters())
+    generator = torch.Generator().manual_seed(seed)
+    direction = [torch.randn(w.shape, generator=generator, dtype=w.dtype) for w in weights]
+    exact = torch.autograd.grad(squared_distance(policy(target), target), weights)
+    slope = sum(float((g * d).sum()) for g, d in zip(exact, direction))
+    values, nudge = [], 1e-7
+    with torch.no_grad():
+        for sign in (1.0, -2.0):  # there, and from there to the other side
+            for w, d in zip(weights, direction):
+                w.add_(d, alpha=sign * nudge)
+            values.append(float(squared_distance(policy(target), target)))
+    return abs((values[0] - values[1]) / (2.0 * nudge) / slope - 1.0)
+
+
 def evaluate(policy: Policy) -> tuple[float, float]:
     """Mean squared distance [m²] and part of the balls struck, in scenes not trained on."""
     target = targets(TESTS, seed=-1)
@@ -191,6 +209,7 @@ def check(training: Training) -> bool:
     share, policy = training.share, training.policy
     expected = reference_gradient(training.seed)
     error = float((training.first_gradient - expected).norm() / expected.norm())
+    differences = gradient_error(training.seed)
     weights = torch.cat([p.detach().flatten() for p in policy.network.parameters()])
     spread = float((share.mean(weights) - weights).abs().max())
     (before, _), (after, struck) = evaluate(Policy(training.seed)), evaluate(policy)
@@ -198,6 +217,7 @@ def check(training: Training) -> bool:
     assert info is not None
     holds = [
         (f"gradient of {share.count} process(es) equals that of one to {error:.1e}", error <= SAME_GRADIENT),
+        (f"and central differences to {differences:.1e}", differences <= GRADIENT_ERROR),
         (f"processes have the same weights (spread {spread:.1e})", spread == 0.0),
         (f"every step converged ({info.failed_steps} did not)", info.converged),
         (f"{100.0 * struck:.0f} % of {TESTS} new balls were struck", struck >= HIT),

@@ -66,7 +66,7 @@ def test_two_processes_give_the_gradient_of_one(tmp_path: Path) -> None:
 def test_training_in_two_processes_passes_its_checks(tmp_path: Path) -> None:
     output, code = run(2, cwd=tmp_path)
     assert code == 0, output
-    assert output.count("ok  ") == 5, output
+    assert output.count("ok  ") == 6, output
 
 
 def test_scenes_must_divide_between_processes(tmp_path: Path) -> None:
