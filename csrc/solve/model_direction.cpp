@@ -39,7 +39,7 @@ void ModelDirection::recall_forces() {
     if (m_list == m_path.list_number()) return;
     m_list = m_path.list_number();
     m_forces.assign(m_zone.contacts.size(), 0.0);
-    m_friction.assign(m_zone.friction != nullptr ? m_zone.contacts.size() : 0, {});
+    m_friction.assign(m_zone.contacts.with_friction ? m_zone.contacts.size() : 0, {});
     if (m_kept.empty()) return;
     for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
         const Contact& contact = m_zone.contacts[k].contact;
@@ -396,7 +396,7 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
     recall_forces();
     advance_multipliers();
     list_near();
-    if (m_near.empty() && driven && m_zone.friction == nullptr) return way;
+    if (m_near.empty() && driven && !m_zone.contacts.with_friction) return way;
     make_model();
     bool cut_more = false;
     for (int listings = 0;;) {

@@ -40,14 +40,8 @@ public:
         m_w.friction.clear();
         if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
         go_to_warm_start();
-        if (m_zone.friction != nullptr) {
-            find_balance(*this, *m_model);
-            if (m_zone.exact_contact) multiplier_rounds();
-            return m_result;
-        }
-        m_near =
-            m_zone.dynamic_count == 1 && m_zone.nodes.empty();  // a factor costs hardly more than the gradient alone
-        iterate();
+        m_near = is_one_body();  // a factor costs hardly more than the gradient alone
+        find_solution();
         if (m_zone.exact_contact) multiplier_rounds();
         return m_result;
     }
@@ -76,9 +70,9 @@ private:
         if (rescue) m_path.rescue();
         m_visited.assign(count + m_zone.cloths.size(), Box());
         mark_visited();
-        if (is_one_body() && m_zone.friction == nullptr)
-            return;  // whose model is made if ever it is asked for, which at rest it is not
-        m_model.emplace(m_zone, m_path, m_w.point, m_w.system);
+        // That of one body is made if ever it is asked for, which at rest without friction it is not.
+        if (is_one_body() && !m_zone.contacts.with_friction) return;
+        make_model();
         m_model->start_from(m_w.point);
     }
 
@@ -216,6 +210,16 @@ private:
             if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] += m_w.step.nodes[i];
     }
 
+    /// By descent for as long as no contact with friction is near, then by balance.
+    void find_solution() {
+        if (!m_zone.contacts.with_friction) iterate();
+        if (!m_zone.contacts.with_friction || m_result.status != ZoneStatus::converged) return;
+        if (!m_model) make_model();
+        find_balance(*this, *m_model);
+    }
+
+    void make_model() { m_model.emplace(m_zone, m_path, m_w.point, m_w.system); }
+
     void iterate() {
         int stalls = 0;
         double best_residual = kInfinity;
@@ -224,6 +228,7 @@ private:
         int futile = 0;  // steps since it fell by more than rounding may do
         for (;; ++m_result.iterations) {
             if (m_options.interrupt != nullptr) m_options.interrupt->throw_if_asked();
+            if (m_zone.contacts.with_friction) return;
             const bool driven = drives_done();
             if (m_result.iterations < m_options.max_iterations) {
                 const ModelStep step = take_model_step(driven, stalls);
@@ -331,7 +336,7 @@ private:
         m_result.residual = current_accuracy().residual;
         if (driven && m_result.residual < kNearSolution) return ModelStep::near;
         m_newton.lose_factor();
-        if (!m_model) m_model.emplace(m_zone, m_path, m_w.point, m_w.system);
+        if (!m_model) make_model();
         const ModelDirection::Way way = m_model->find(m_w.derivatives.gradient, driven, m_w.y_end);
         if (!m_zone.nodes.empty()) m_model_factors += way.newton_steps;
         if (!way.found) return ModelStep::near;
@@ -380,7 +385,7 @@ private:
             if (violation <= kExactTolerance) return;
             if (round >= kMaxMultiplierRounds) return fail(ZoneStatus::too_many_iterations);
             m_path.shift_contacts(m_rounds.stiffening(m_zone, violation));
-            m_zone.friction != nullptr ? find_balance(*this, *m_model) : iterate();
+            find_solution();
         }
     }
 

@@ -3,6 +3,7 @@
 namespace diffsim {
 
 void ContactSet::clear() {
+    with_friction = false;
     pairs.clear();
     contacts.clear();
     laws.clear();

@@ -72,6 +72,7 @@ struct ContactSet {
     FeatureVertices vertices;
     IndexPairs blocks;  ///< of dynamic bodies with contacts
     ContactMemory memory;
+    bool with_friction = false;  ///< some contact has any
 
     std::size_t size() const { return contacts.size(); }
     bool empty() const { return contacts.empty(); }

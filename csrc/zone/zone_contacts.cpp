@@ -109,7 +109,10 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
         set.laws.back().stiffness = with_sides(zone, set[set.size() - 1], [&](const auto& side_a, const auto& side_b) {
             return contact_stiffness(side_a.mass(), side_b.mass(), zone.contacts.memory.compliance);
         });
-        if (zone.friction != nullptr) set_friction(zone, contact, set.laws.back());
+        if (zone.friction != nullptr) {
+            set_friction(zone, contact, set.laws.back());
+            set.with_friction = set.with_friction || set.laws.back().friction > 0.0;
+        }
     }
     list_feature_vertices(zone, set[set.size() - 1]);
 }
