@@ -137,6 +137,28 @@ def test_cloth_example_fails_where_it_should(
 
 
 @pytest.mark.parametrize(
+    ("name", "arguments", "fails"),
+    [
+        ("dominoes", ["--duration", "0.3"], "presses on the ground with its weight"),
+    ],
+)
+def test_example_fails_where_gravity_is_less(
+    name: str, arguments: list[str], fails: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = ds.Simulator.__init__
+
+    def make(sim: ds.Simulator, *args: object, **settings: object) -> None:
+        made(sim, *args, **settings)  # type: ignore[arg-type]
+        with torch.no_grad():
+            sim.gravity *= 0.9
+
+    monkeypatch.setattr(ds.Simulator, "__init__", make)
+    assert load(name).main(["--quick", "--no-picture", *arguments]) == 1
+    wrong = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL ")]
+    assert any(fails in line for line in wrong), wrong
+
+
+@pytest.mark.parametrize(
     ("name", "holds"), [("estimate_mass", 7), ("mujoco_interop", 6), ("learn_sticks", 5), ("learn_cloth", 6)]
 )
 def test_application_passes(name: str, holds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
