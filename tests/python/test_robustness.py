@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import resource
-import subprocess
+import runpy
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +25,34 @@ FUZZ = Path(__file__).parent.parent / "fuzz.py"
 STATM = Path("/proc/self/statm")
 
 
-def test_random_scenes() -> None:
+@pytest.fixture
+def fuzz(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[str], tuple[int, str]]:
+    """Exit code and output of the fuzz script, run here, where torch is loaded already."""
+
+    def run(options: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", [str(FUZZ), *options.split()])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(FUZZ), run_name="__main__")
+        return int(ended.value.code or 0), capsys.readouterr().out
+
+    return run
+
+
+def test_random_scenes(fuzz: Callable[[str], tuple[int, str]]) -> None:
     """A few of the scenes of the fuzz script, which can run longer."""
-    command = [sys.executable, str(FUZZ), "--scenes", "3", "--steps", "200", "--first", "4"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stdout + found.stderr
-    assert "3 scenes of 10 bodies and 200 steps" in found.stdout
-    assert ": 0 scenes with problems" in found.stdout
+    code, output = fuzz("--scenes 3 --steps 200 --first 4")
+    assert code == 0, output
+    assert "3 scenes of 10 bodies and 200 steps" in output
+    assert ": 0 scenes with problems" in output
 
 
 @pytest.mark.parametrize(("scene", "steps"), [(1, 34), (26, 6)])
-def test_heaps_whose_hessian_is_indefinite_converge(scene: int, steps: int) -> None:
+def test_heaps_whose_hessian_is_indefinite_converge(
+    fuzz: Callable[[str], tuple[int, str]], scene: int, steps: int
+) -> None:
     """Scenes with a step that does not converge if contacts' curvature is always left out."""
-    options = ["--scenes", "1", "--first", str(scene), "--steps", str(steps)]
-    found = subprocess.run([sys.executable, str(FUZZ), *options], capture_output=True, text=True, check=False)
-    assert f"0 of {steps} steps in 0 scenes did not converge" in found.stdout, found.stdout + found.stderr
+    _, output = fuzz(f"--scenes 1 --first {scene} --steps {steps}")
+    assert f"0 of {steps} steps in 0 scenes did not converge" in output, output
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -64,13 +78,12 @@ def test_light_bodies_among_heavy_ones_converge(seed: int) -> None:
     assert_no_penetration(scene, sim, trajectory)
 
 
-def test_derivatives_in_random_scenes_with_cloth() -> None:
+def test_derivatives_in_random_scenes_with_cloth(fuzz: Callable[[str], tuple[int, str]]) -> None:
     """No derivative of a step disagrees with central differences of every step size."""
-    options = ["--scenes", "3", "--steps", "60", "--bodies", "4", "--cloths", "1", "--gradients", "20"]
-    found = subprocess.run([sys.executable, str(FUZZ), *options], capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stdout + found.stderr
-    assert ": 0 scenes with problems" in found.stdout
-    derivatives = int(found.stdout.rsplit("; ", 1)[1].split()[0])
+    code, output = fuzz("--scenes 3 --steps 60 --bodies 4 --cloths 1 --gradients 20")
+    assert code == 0, output
+    assert ": 0 scenes with problems" in output
+    derivatives = int(output.rsplit("; ", 1)[1].split()[0])
     assert derivatives > 50
 
 
