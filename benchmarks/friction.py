@@ -8,7 +8,8 @@ differences of two whole runs, as it has no derivative by friction. A step's own
 part of all of them. `forward_ms` is the time of the slide's 0.5 s, `gradient_ms` that of the derivative over 0.6 s.
 
 MuJoCo runs with its default contacts and pyramidal cones, elliptic ones, and elliptic ones with impratio 100, by which
-it fights creep; its steps are looped over from Python. One thread; medians over rounds, one CSV line per run, and a plot of the errors against the time.
+it fights creep; its steps are looped over from Python. One thread; medians over rounds, one CSV line per run, and a
+plot of the errors against the time.
 Needs the extra `bench`.
 """
 

@@ -46,9 +46,9 @@ struct StepInfo {
     ZoneStatus status = ZoneStatus::converged;  ///< of the first zone that did not converge
     int contacts = 0;
     int sticking = 0, slipping = 0;  ///< of those with friction
-    int zones = 0;         ///< groups of bodies and cloths in contact
-    int largest_zone = 0;  ///< bodies and cloths
-    int iterations = 0;    ///< Newton steps of the zone that took most
+    int zones = 0;                   ///< groups of bodies and cloths in contact
+    int largest_zone = 0;            ///< bodies and cloths
+    int iterations = 0;              ///< Newton steps of the zone that took most
     double residual = 0.0;
     double max_compression = 0.0;  ///< of a contact below its rest distance [m]
     int fast_impacts = 0;          ///< pairs of bodies with a fast ImpactGate
