@@ -12,7 +12,7 @@
 namespace diffsim {
 namespace {
 
-struct Substep {
+struct ConservingSubstep {
     Mat3 R0, inertia;  ///< at its start, the inertia in the world frame
     Vec3 momentum;     ///< at its end
     Vec3 u;            ///< angular velocity at its end, turned back to its start
@@ -22,16 +22,16 @@ struct Substep {
 };
 
 /// d(I u - Exp(-dt (w0 + u) / 2) momentum)/du, given the left Jacobian at the rotation.
-Mat3 residual_jacobian(const Substep& substep, double dt, const Mat3& jacobian) {
+Mat3 conserving_jacobian(const ConservingSubstep& substep, double dt, const Mat3& jacobian) {
     return substep.inertia - 0.5 * dt * (substep.turn.transpose() * skew(substep.momentum) * jacobian);
 }
 
 /// Newton's method from the guess, run until rounding stops it.
-Substep solve_substep(
+ConservingSubstep solve_conserving_substep(
     const Mat3& R0, const Vec3& w0, const Vec3& guess, const Vec3& momentum, const Mat3& inertia_body, double dt) {
-    Substep best;
+    ConservingSubstep best;
     double best_residual = kInfinity;
-    Substep trial;
+    ConservingSubstep trial;
     trial.R0 = R0;
     trial.inertia = R0 * inertia_body * R0.transpose();
     trial.momentum = momentum;
@@ -47,7 +47,7 @@ Substep solve_substep(
         best = trial;
         best_residual = norm;
         if (norm <= 0.5 * kEpsilon * momentum.norm()) break;
-        trial.u -= residual_jacobian(trial, dt, left_jacobian(trial.rotation)).partialPivLu().solve(residual);
+        trial.u -= conserving_jacobian(trial, dt, left_jacobian(trial.rotation)).partialPivLu().solve(residual);
     }
     best.converged =
         std::isfinite(best_residual) && best_residual <= 16.0 * kEpsilon * scale && best.rotation.norm() < 3.0;
@@ -55,9 +55,9 @@ Substep solve_substep(
 }
 
 /// The whole step in a given number of substeps; empty if one of them did not converge.
-std::vector<Substep> solve_substeps(
+std::vector<ConservingSubstep> solve_conserving_substeps(
     const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt, int count) {
-    std::vector<Substep> substeps;
+    std::vector<ConservingSubstep> substeps;
     substeps.reserve(static_cast<std::size_t>(count));
     const double dt_sub = dt / count;
     Mat3 R = R0;
@@ -66,8 +66,8 @@ std::vector<Substep> solve_substeps(
     for (int k = 0; k < count; ++k) {
         momentum += dt_sub * torque;
         const Vec3 guess = initial_guess(R * inertia_body * R.transpose(), w, torque, dt_sub);
-        substeps.push_back(solve_substep(R, w, guess, momentum, inertia_body, dt_sub));
-        const Substep& substep = substeps.back();
+        substeps.push_back(solve_conserving_substep(R, w, guess, momentum, inertia_body, dt_sub));
+        const ConservingSubstep& substep = substeps.back();
         if (!substep.converged) return {};
         R = substep.turn * R;
         w = substep.turn * substep.u;
@@ -83,9 +83,10 @@ FreeRotation conserving_rotation(
     const Vec3 guess = initial_guess(R0 * inertia_body * R0.transpose(), angular_velocity, torque, dt);
     for (int count = substeps_for(dt * std::max(angular_velocity.norm(), guess.norm())); count <= kMaxSubsteps;
          count *= 2) {
-        const std::vector<Substep> substeps = solve_substeps(R0, angular_velocity, torque, inertia_body, dt, count);
+        const std::vector<ConservingSubstep> substeps =
+            solve_conserving_substeps(R0, angular_velocity, torque, inertia_body, dt, count);
         if (substeps.empty()) continue;
-        const Substep& last = substeps.back();
+        const ConservingSubstep& last = substeps.back();
         const Vec3 w = last.turn * last.u;
         if (count == 1) return {w, last.rotation, 1};
         return {w, log_rotation(last.turn * last.R0 * R0.transpose()), count};
@@ -101,8 +102,8 @@ FreeRotationGradient conserving_rotation_backward(
         grad.angular_velocity = grad_angular_velocity;
         return grad;
     }
-    const std::vector<Substep> substeps =
-        solve_substeps(R0, angular_velocity, torque, inertia_body, dt, result.substeps);
+    const std::vector<ConservingSubstep> substeps =
+        solve_conserving_substeps(R0, angular_velocity, torque, inertia_body, dt, result.substeps);
     assert(!substeps.empty());  // as in the forward
     const bool single = substeps.size() == 1;
     const double half = 0.5 * dt / static_cast<double>(substeps.size());
@@ -116,7 +117,7 @@ FreeRotationGradient conserving_rotation_backward(
     Vec3 grad_w = grad_angular_velocity;
     Vec3 grad_momentum = Vec3::Zero();  // of that at the start, and of what torque adds in the substep at hand
     for (std::size_t k = substeps.size(); k-- > 0;) {
-        const Substep& substep = substeps[k];
+        const ConservingSubstep& substep = substeps[k];
         const Mat3 jacobian = left_jacobian(substep.rotation);
         // w1 = Exp(rotation) u and R1 = Exp(rotation) R0
         const Vec3 w1 = substep.turn * substep.u;
@@ -125,7 +126,7 @@ FreeRotationGradient conserving_rotation_backward(
         const Vec3 grad_u = substep.turn.transpose() * grad_w + half * grad_turn;
         // I u - Exp(-rotation) momentum = 0
         const Vec3 multiplier =
-            residual_jacobian(substep, 2.0 * half, jacobian).transpose().partialPivLu().solve(grad_u);
+            conserving_jacobian(substep, 2.0 * half, jacobian).transpose().partialPivLu().solve(grad_u);
         const Vec3 by_momentum = substep.turn * multiplier;
         grad_turn += jacobian.transpose() * by_momentum.cross(substep.momentum);
         grad_momentum += by_momentum;
