@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from small_scenes import STATE_FIELDS, assert_same
+from small_scenes import assert_same
 from torch import Tensor
 
 import diffsim as ds
@@ -96,8 +96,27 @@ def test_a_pair_without_friction_on_one_side_is_frictionless() -> None:
         for mu, ground in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0))
     )
     assert_same(without, on_rough)
-    for name in STATE_FIELDS:
-        torch.testing.assert_close(getattr(rough, name), getattr(without, name), rtol=0.0, atol=1e-7)
+    assert_same(without, rough)
+
+
+def test_contacts_tell_what_holds_a_box() -> None:
+    sim = on_ground(0.5, degrees=20.0)
+    contacts = sim.contacts(end_of(sim, 10))
+    weight = sim.mass.item() * G
+    slope = math.radians(20.0)
+    assert contacts.sticking.all() and sim.info.sticking == len(contacts) and sim.info.slipping == 0
+    assert contacts.friction[:, 0].sum().item() == pytest.approx(-weight * math.sin(slope), rel=1e-9)
+    assert contacts.normal_force[:, 2].sum().item() == pytest.approx(weight * math.cos(slope), rel=1e-9)
+    torch.testing.assert_close(contacts.force, contacts.normal_force + contacts.friction)
+    sliding = on_ground(0.2, degrees=20.0)
+    contacts = sliding.contacts(end_of(sliding, 10))
+    assert not contacts.sticking.any() and sliding.info.slipping == len(contacts)
+    share = contacts.friction.norm(dim=-1) / contacts.normal_force.norm(dim=-1)
+    torch.testing.assert_close(share, torch.full_like(share, 0.2))
+    start = sliding.initial_state()
+    start.velocity.requires_grad_()
+    with pytest.raises(NotImplementedError, match="friction have no gradient"):
+        sliding.contacts(start).force.sum().backward()
 
 
 def test_a_sphere_rolls() -> None:
