@@ -70,7 +70,7 @@ class Simulator(SceneIdentity, Measurements):
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
         integrator: "implicit_euler", of first order, or "trapezoidal", of second order where bodies move freely: a
             projectile is exact and free spin keeps its energy. What is in contact has a second solve, and cloth keeps
-            implicit Euler (docs/conventions.md).
+            implicit Euler (docs/conventions.md). Not with ``coupling="split"``.
         coupling: "monolithic" or "split": whether cloth and what touches it are solved at once, or the cloth's elastic
             step first and its contacts after it, as the paper does. Without cloth the two are the same.
         zones: "local": bodies and cloths are solved together only if they may meet, the default. "global": all at once,
@@ -124,6 +124,8 @@ class Simulator(SceneIdentity, Measurements):
         check_choice(where, "adjoint", adjoint, ("exact", "qr", "dense"))
         check_choice(where, "integrator", integrator, ("implicit_euler", "trapezoidal"))
         check_choice(where, "coupling", coupling, ("monolithic", "split"))
+        if integrator == "trapezoidal" and coupling == "split":
+            raise ValueError(f"{where}: integrator='trapezoidal' must be used with coupling='monolithic', got 'split'")
         check_choice(where, "zones", zones, ("local", "global"))
         check_choice(where, "on_failure", on_failure, ("warn", "raise"))
         compliance = check_number(where, "compliance", compliance, least=0.0)

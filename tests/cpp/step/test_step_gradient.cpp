@@ -333,13 +333,16 @@ TEST(step_gradient_of_split_coupling) {
 TEST(step_gradient_of_split_coupling_with_soft_contacts) {
     check_step_gradient(with_compliance(with_split(caught_box()), 0.1), 1);
 }
-TEST(trapezoidal_tumbling) { check_step_gradient(by_trapezoids(tumbling()), 0); }
-TEST(trapezoidal_tilted_landing) { check_step_gradient(by_trapezoids(tilted_landing()), 1); }
-TEST(trapezoidal_free_collision) { check_step_gradient(by_trapezoids(free_collision()), 1); }
-TEST(trapezoidal_pushed_ball) { check_step_gradient(by_trapezoids(pushed_ball()), 2); }
-TEST(trapezoidal_caught_box) { check_step_gradient(by_trapezoids(caught_box()), 1); }
-TEST(trapezoidal_split) { check_step_gradient(by_trapezoids(with_split(caught_box())), 1); }
-TEST(trapezoidal_hard) {
+TEST(step_gradient_of_the_trapezoidal_scheme_tumbling) { check_step_gradient(by_trapezoids(tumbling()), 0); }
+TEST(step_gradient_of_the_trapezoidal_scheme_tilted_landing) {
+    check_step_gradient(by_trapezoids(tilted_landing()), 1);
+}
+TEST(step_gradient_of_the_trapezoidal_scheme_free_collision) {
+    check_step_gradient(by_trapezoids(free_collision()), 1);
+}
+TEST(step_gradient_of_the_trapezoidal_scheme_pushed_ball) { check_step_gradient(by_trapezoids(pushed_ball()), 2); }
+TEST(step_gradient_of_the_trapezoidal_scheme_caught_box) { check_step_gradient(by_trapezoids(caught_box()), 1); }
+TEST(step_gradient_of_the_trapezoidal_scheme_hard) {
     check_step_gradient(by_trapezoids(with_compliance(caught_box(), 0.0)), 1, 10.0 * kDifferences);
 }
 
