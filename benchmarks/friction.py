@@ -40,9 +40,9 @@ SLIDES = 0.5  # [s]
 OURS = (0.02, 0.01, 0.005, 0.002)  # [s]
 THEIRS = (0.01, 0.005, 0.002, 0.001)
 MUJOCO = {
-    "MuJoCo, pyramidal": 'cone="pyramidal"',
-    "MuJoCo, elliptic": 'cone="elliptic"',
-    "MuJoCo, elliptic, impratio 100": 'cone="elliptic" impratio="100"',
+    "MuJoCo pyramidal": 'cone="pyramidal"',
+    "MuJoCo elliptic": 'cone="elliptic"',
+    "MuJoCo elliptic impratio 100": 'cone="elliptic" impratio="100"',
 }
 EPS = 1e-3  # of MuJoCo's differences, of the coefficient
 

@@ -199,5 +199,5 @@ def test_a_scene_without_cloth_hands_the_core_none(monkeypatch: pytest.MonkeyPat
     ):
         assert end.node_position.shape[-2:] == (0, 3)
     for inputs, outputs in zip(given[::2], given[1::2], strict=True):
-        assert [k for k in (4, 5, 8, 11, 15, 16, 17, 18, 19) if inputs[k] is not None] == []
+        assert [k for k in (4, 5, 8, 11, 16, 17, 18, 19, 20) if inputs[k] is not None] == []
         assert outputs[4] is outputs[5] is None
