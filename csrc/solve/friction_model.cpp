@@ -155,8 +155,8 @@ private:
         });
     }
 
-    /// One contact's, to the sums of its bodies and to its nodes. Sticking it is as stiff along both tangents, slipping only across its
-    /// slip.
+    /// One contact's, to the sums of its bodies and to its nodes. Sticking it is as stiff along both tangents, slipping
+    /// only across its slip.
     void add_friction(std::size_t f, Vector<9>& force, HalfSymmetric<9>& stiffness, BlockSystem* system) {
         const FrictionRow& slip = m_friction[f];
         const ContactRow& row = m_rows[slip.normal];
