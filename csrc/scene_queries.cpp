@@ -1,5 +1,6 @@
 #include "scene_queries.hpp"
 
+#include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 #include <stdexcept>

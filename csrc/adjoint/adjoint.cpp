@@ -1,5 +1,6 @@
 #include "adjoint/adjoint.hpp"
 
+#include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 #include <utility>

@@ -1,5 +1,6 @@
 #include "contact/contact.hpp"
 
+#include <Eigen/Geometry>
 #include <array>
 #include <cmath>
 

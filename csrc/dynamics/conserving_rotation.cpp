@@ -1,5 +1,6 @@
 #include "dynamics/conserving_rotation.hpp"
 
+#include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <algorithm>
 #include <cassert>

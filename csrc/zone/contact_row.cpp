@@ -1,5 +1,6 @@
 #include "zone/contact_row.hpp"
 
+#include <Eigen/Geometry>
 #include <type_traits>
 
 #include "math/rotation.hpp"

@@ -1,5 +1,6 @@
 #include "zone/friction_row.hpp"
 
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <type_traits>
 
