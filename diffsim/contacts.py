@@ -18,6 +18,10 @@ __all__ = ["Contacts"]
 
 _PARALLEL_LIMIT = 1e-3  # squared sine below which a pair of edges is mollified: kParallelLimit of the core
 
+# Why some forces have no gradient: a hard contact's distance is always the same, and what sticks does not slip.
+_HARD = "forces of hard contacts (compliance=0) have no gradient; with the default compliance they have"
+_STICKING = "forces of friction have no gradient; take normal_force, or the momentum of the state itself"
+
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -129,14 +133,14 @@ def contacts_from(
         log_mass = _mass_of_side(core, side, mass, cloth_density, cloth_of_node).log()
         magnitude = magnitude + core["force"] * core["mass_exponent"][:, side] * _change(log_mass)
     if hard:
-        magnitude = _HardForce.apply(magnitude)  # type: ignore[no-untyped-call]
+        magnitude = _WithoutGradient.apply(magnitude, _HARD)  # type: ignore[no-untyped-call]
     magnitude = magnitude * (1.0 + _change(_log_mollifier(core["sine_sq"], first, second)))
     change_of_normal = _change(normal)
     normal = core["normal"] + change_of_normal
     normal_force = magnitude[:, None] * normal
     force, friction = normal_force, core["friction"]
     if friction.any():
-        friction = _FrictionForce.apply(friction + change_of_normal)  # type: ignore[no-untyped-call]
+        friction = _WithoutGradient.apply(friction + change_of_normal, _STICKING)  # type: ignore[no-untyped-call]
         force = normal_force + friction
     middle = core["point"].mean(dim=1) + _change(point - 0.5 * offset)
     return Contacts(
@@ -154,32 +158,17 @@ def contacts_from(
     )
 
 
-class _HardForce(torch.autograd.Function):
-    """The reaction of a hard contact: where the step ends does not tell it, as the distance is always the same."""
+class _WithoutGradient(torch.autograd.Function):
+    """A force that where the step ends does not tell: its gradient is refused, with the reason."""
 
     @staticmethod
-    def forward(ctx: Any, force: Tensor) -> Tensor:
+    def forward(ctx: Any, force: Tensor, reason: str) -> Tensor:
+        ctx.reason = reason
         return force.view_as(force)
 
     @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
-        raise NotImplementedError(
-            "contacts: forces of hard contacts (compliance=0) have no gradient; with the default compliance they have"
-        )
-
-
-class _FrictionForce(torch.autograd.Function):
-    """What holds contacts across their normals: where the step ends does not tell it of those that stick."""
-
-    @staticmethod
-    def forward(ctx: Any, force: Tensor) -> Tensor:
-        return force.view_as(force)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
-        raise NotImplementedError(
-            "contacts: forces of friction have no gradient; take normal_force, or the momentum of the state itself"
-        )
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        raise NotImplementedError(f"contacts: {ctx.reason}")
 
 
 def _change(value: Tensor) -> Tensor:
