@@ -31,12 +31,8 @@ void merge_info(StepInfo& total, const StepInfo& scene) {
     total.slipping += scene.slipping;
     total.zones += scene.zones;
     total.largest_zone = std::max(total.largest_zone, scene.largest_zone);
-    total.iterations = std::max(total.iterations, scene.iterations);
-    total.residual = std::max(total.residual, scene.residual);
     total.max_compression = std::max(total.max_compression, scene.max_compression);
-    total.seconds_motion += scene.seconds_motion;
-    total.seconds_broad_phase += scene.seconds_broad_phase;
-    total.seconds_zones += scene.seconds_zones;
+    total.add_effort(scene);
 }
 
 void note_failure(const StepInfo& step, int scene, int time, RolloutInfo& info) {

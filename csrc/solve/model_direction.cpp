@@ -19,9 +19,6 @@ constexpr int kMaxFastRounds = 10;  // where bodies move so fast for their size 
 constexpr int kMaxShortenings = 6;  // of the way of bodies that something still stops
 constexpr double kCrawling = 0.2;   // of a Newton step: rows are not followed so
 constexpr std::array<double, 3> kStages = {1e-2, 1e-1, 1.0};  // of the rows' stiffness
-constexpr double kProximal = 1.0;                             // of the inertia: the first damping of a body
-constexpr double kMoreProximal = 4.0;
-constexpr double kExcess = 0.1;  // of the largest excess of energy: contacts that ask for damping
 
 bool before(const Contact& c, const Contact& d) {
     return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
@@ -485,39 +482,6 @@ ModelDirection::Way ModelDirection::find(const Coordinates& gradient, bool drive
 bool ModelDirection::asks_for_too_much() const {
     const auto is_beyond = [](const ContactRow& row) { return row.force > row.stiffness * row.range; };
     return std::any_of(m_model.rows.begin(), m_model.rows.end(), is_beyond);
-}
-
-// --- damping ----------------------------------------------------------------------------------------------------------
-
-void ModelDirection::damp(const ZonePoint& trial, double rise) {
-    std::vector<double> excess(trial.active.size());
-    double largest = 0.0, sum = 0.0;
-    for (std::size_t k = 0; k < trial.active.size(); ++k) {
-        const ActiveContact& active = trial.active[k];
-        const ZoneContact& contact = m_zone.contacts[active.index];
-        const double force = m_forces[active.index];
-        excess[k] = contact_energy(active.geometry, contact.law) - 0.5 * force * force / contact.law.stiffness.value;
-        largest = std::max(largest, excess[k]);
-        sum += std::max(excess[k], 0.0);
-    }
-    // Where that does not explain the rise, all bodies are damped.
-    std::vector<char> marked(m_weight.size(), sum < 0.5 * rise ? 1 : 0);
-    for (std::size_t k = 0; k < trial.active.size(); ++k) {
-        if (!(excess[k] > kExcess * largest)) continue;
-        const ZoneContact& contact = m_zone.contacts[trial.active[k].index];
-        visit_movers(
-            m_zone, contact,
-            [&](int body) {
-                if (m_zone.yields(body)) marked[body] = 1;
-            },
-            [&](int node) { marked[static_cast<std::size_t>(m_zone.dynamic_count + node)] = 1; });
-    }
-    for (std::size_t i = 0; i < m_weight.size(); ++i)
-        if (marked[i]) m_weight[i] = std::max(kProximal, kMoreProximal * m_weight[i]);
-}
-
-void ModelDirection::relax() {
-    for (double& weight : m_weight) weight = weight > kProximal ? weight / kMoreProximal : 0.0;
 }
 
 }  // namespace diffsim

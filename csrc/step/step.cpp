@@ -427,6 +427,14 @@ ThreadMemory& StepWorkspace::memory(int thread) {
     return *memory;
 }
 
+void StepInfo::add_effort(const StepInfo& other) {
+    iterations = std::max(iterations, other.iterations);
+    residual = std::max(residual, other.residual);
+    seconds_motion += other.seconds_motion;
+    seconds_broad_phase += other.seconds_broad_phase;
+    seconds_zones += other.seconds_zones;
+}
+
 std::size_t StepRecord::bytes() const {
     return sizeof(*this) + start.bodies.capacity() * sizeof(BodyState) +
            free_rotation.capacity() * sizeof(FreeRotation) + y.bodies.capacity() * sizeof(Vec6) +

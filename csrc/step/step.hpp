@@ -55,6 +55,9 @@ struct StepInfo {
     double seconds_motion = 0.0, seconds_broad_phase = 0.0, seconds_zones = 0.0;
     std::uint64_t signature = 0;      ///< hash of the active contacts and their types
     std::vector<int> failed_objects;  ///< bodies and cloths of what did not converge, ascending
+
+    /// Let it speak of another solve's effort, too: counts of contacts and what became of them are not added.
+    void add_effort(const StepInfo& other);
 };
 
 /// Objects penetrate in the state a step was to start from; says which.

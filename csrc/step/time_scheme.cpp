@@ -28,12 +28,8 @@ void add_info(const StepInfo& velocities, StepInfo& info) {
         if (info.converged) info.status = velocities.status;
         info.converged = false;
     }
-    info.iterations = std::max(info.iterations, velocities.iterations);
-    info.residual = std::max(info.residual, velocities.residual);
+    info.add_effort(velocities);
     info.fast_impacts = std::max(info.fast_impacts, velocities.fast_impacts);
-    info.seconds_motion += velocities.seconds_motion;
-    info.seconds_broad_phase += velocities.seconds_broad_phase;
-    info.seconds_zones += velocities.seconds_zones;
     info.signature = mix(info.signature, velocities.signature);
     std::vector<int> failed;
     std::set_union(
