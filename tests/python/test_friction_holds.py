@@ -1,0 +1,124 @@
+"""What friction holds: a jam, a tall stack, a sheet laid over a ball; and a rod that cannot slide smoothly."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from energy_rises import rises_of_energy
+
+import diffsim as ds
+
+DT = 0.01
+G = 9.81
+
+
+def turned(degrees: float) -> tuple[float, float, float, float]:
+    """The x axis up by so much."""
+    half = 0.5 * math.radians(degrees)
+    return (math.cos(half), 0.0, -math.sin(half), 0.0)
+
+
+def ball_under_a_gable(mu: float, half: float) -> ds.Simulator:
+    """It touches two boards that lean on each other, open downwards by 2 `half` [°]."""
+    radius = 0.2
+    scene = ds.Scene()
+    away, angle = radius + 0.051, math.radians(half)
+    for side in (-1.0, 1.0):
+        place = (side * away * math.cos(angle), 0.0, away * math.sin(angle))
+        board = ds.shapes.box((0.1, 1.0, 2.0))
+        scene.add_body(board, kind="static", position=place, orientation=turned(side * half), friction=mu)
+    scene.add_sphere(radius, density=1000.0, friction=mu)
+    return ds.Simulator(scene, DT, on_failure="raise")
+
+
+def threshold(half: float, push: float) -> float:
+    """The least μ that holds a ball pushed up by `push` weights and let go.
+
+    Pushed, it slides, and 2 N (sin + μ cos) = (push - 1) m g. That N stays, and holds it if 2 N (μ cos - sin) > m g.
+    """
+    return math.tan(math.radians(half)) * push / (push - 2.0)
+
+
+@pytest.mark.parametrize(("of_threshold", "holds"), [(0.98, False), (1.02, True), (4.0, True)])
+def test_a_ball_pushed_into_a_gap_jams_where_it_should(of_threshold: float, holds: bool) -> None:
+    half, push, steps = 20.0, 30.0, 20
+    mu = of_threshold * threshold(half, push)  # 0.39, and at last 1.56
+    sim = ball_under_a_gable(mu, half)
+    force = torch.zeros(300, 3, 3, dtype=torch.float64)
+    force[:steps, 2, 2] = push * sim.mass[2].detach() * G
+    path = sim.rollout(sim.initial_state(), ds.Control(force=force), 300)
+    if holds:
+        assert (path.position[-1] - path.position[steps]).abs().max() < 1e-9
+        assert path.velocity[-1].abs().max() < 1e-9
+    else:
+        assert path.position[-1, 2, 2] < -1.0
+
+
+@pytest.mark.parametrize("speed", [-5.0, -1.0, 1.0, 5.0])
+@pytest.mark.parametrize("mu", [0.5, 1.5, 3.0])
+@pytest.mark.filterwarnings("ignore::diffsim.ConvergenceWarning")
+def test_a_rod_that_chatters_is_finite_and_comes_to_lie(mu: float, speed: float) -> None:
+    """Painlevé's: with much friction it can neither slide on its tip nor leave the ground. What fails is reported."""
+    radius, length = 0.02, 1.0
+    scene = ds.Scene()
+    scene.add_ground(friction=mu)
+    height = 0.5 * length * math.sin(math.radians(63.0)) + radius + 1e-5
+    # A capsule's axis is z.
+    place = {"orientation": turned(63.0 - 90.0), "position": (0.0, 0.0, height)}
+    scene.add_capsule(radius, length, density=1000.0, velocity=(speed, 0.0, 0.0), friction=mu, name="rod", **place)
+    sim = ds.Simulator(scene, DT)
+    frames = [sim.initial_state()]
+    for _ in range(150):
+        frames.append(sim(frames[-1]))
+        assert sim.info is not None
+        assert sim.info.converged or "rod" in str(sim.info.failures)
+    path = ds.State.stack(frames)
+    assert path.position.isfinite().all()
+    assert path.velocity.abs().max() < 1.1 * max(abs(speed), math.sqrt(3.0 * G * length))
+    assert path.position[-1, 0, 2] < 1.01 * radius
+    assert path.velocity[-1].abs().max() < 1e-9
+    assert rises_of_energy(sim, frames) == []
+
+
+def test_a_sheet_stays_on_a_ball() -> None:
+    def draped(mu: float) -> ds.State:
+        scene = ds.Scene()
+        scene.add_sphere(0.25, kind="static", position=(0.0, 0.0, 0.25), friction=mu)
+        material = ds.ClothMaterial.isotropic(young=1e5, thickness=2e-3, density=300.0, poisson=0.3, damping=1e-2)
+        scene.add_cloth(ds.shapes.sheet(0.4, 5), material, position=(0.03, 0.0, 0.502), friction=mu)
+        sim = ds.Simulator(scene, DT, on_failure="raise")
+        return sim.rollout(sim.initial_state(), steps=150)
+
+    path = draped(0.4)
+    assert path.node_position[-1, :, 2].min() < 0.42  # it hangs over
+    assert path.node_velocity[-1].abs().max() < 1e-9
+    assert (path.node_position[-1] - path.node_position[100]).abs().max() < 1e-9
+    assert draped(0.0).node_position[-1, :, 2].max() < 0.0
+
+
+@pytest.mark.slow
+def test_a_tall_stack_with_a_heavy_top_stands_still() -> None:
+    scene = ds.Scene()
+    scene.add_ground(friction=0.5)
+    for k in range(20):
+        density = 1e6 if k == 19 else 1e3
+        scene.add_body(ds.shapes.box(1.0), density=density, position=(0.0, 0.0, 1.001 * k + 0.501), friction=0.5)
+    sim = ds.Simulator(scene, DT, on_failure="raise")
+    path = sim.rollout(sim.initial_state(), steps=1000)
+    assert (path.position[-1] - path.position[100]).abs().max() < 1e-9
+    assert path.velocity[-1].abs().max() < 1e-9
+
+
+def test_a_leaning_stack_stands() -> None:
+    """Each offset by a tenth from the one below, this way and that."""
+    scene = ds.Scene()
+    scene.add_ground(friction=0.5)
+    for k in range(10):
+        place = (0.05 * (-1.0) ** k, 0.0, 1.001 * k + 0.501)
+        scene.add_body(ds.shapes.box(1.0), density=1000.0, position=place, friction=0.5)
+    sim = ds.Simulator(scene, DT, on_failure="raise")
+    path = sim.rollout(sim.initial_state(), steps=300)
+    assert (path.position[-1] - path.position[100]).abs().max() < 1e-9
+    assert path.velocity[-1].abs().max() < 1e-9
