@@ -13,7 +13,6 @@ stiff. Needs the extra `bench`.
 
 from __future__ import annotations
 
-import multiprocessing
 import statistics
 import sys
 from collections.abc import Callable
@@ -29,6 +28,7 @@ from _common import (
     added_memory,
     advance,
     differentiate,
+    fresh_processes,
     in_turns,
     make_parser,
     median_ratio,
@@ -115,8 +115,8 @@ def main() -> int:
     table = Table(COLUMNS)
     rounds: dict[int, list[dict[str, float]]] = {count: [] for count in options.counts}
     with ExitStack() as stack:
-        spawn = multiprocessing.get_context("spawn")
-        workers = {count: stack.enter_context(ProcessPoolExecutor(1, spawn)) for count in options.counts}
+        processes = fresh_processes()
+        workers = {count: stack.enter_context(ProcessPoolExecutor(1, processes)) for count in options.counts}
         facts = {count: worker.submit(Worker.prepare, count).result() for count, worker in workers.items()}
         for _ in range(options.rounds):  # the numbers of cubes take turns, too, for the sake of the slopes
             for count, worker in workers.items():

@@ -21,7 +21,7 @@ from diffsim import scenes
 
 COLUMNS = ("case", "cubes", "steps", "checkpoint_every", "peak_mb", "before_mb", "seconds", "tape_bytes_per_body_step")
 CASES = {"long": (100, 10_000, 100), "large": (10_000, 200, None)}
-QUICK = {"long": (100, 1000, 50), "large": (1000, 200, None)}
+QUICK = {"long": (20, 200, 20), "large": (100, 50, None)}
 DT = 0.01
 
 

@@ -47,7 +47,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=200)
     options = parser.parse_args()
     if options.quick:
-        options.counts, options.rounds, options.steps = (20, 1000), 3, 80
+        options.counts, options.rounds, options.steps = (20, 400), 1, 20
     torch.set_num_threads(1)
     print_header(clock=options.clock)
     print_row(COLUMNS)
