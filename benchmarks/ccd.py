@@ -296,7 +296,7 @@ def measure(name: str, count: int, rounds: int, clock: Callable[[], float]) -> d
 def main() -> int:
     options = make_parser(__doc__, rounds=3).parse_args()
     print_header("ipctk", clock=options.clock)
-    count, rounds = (10, 1) if options.quick else (QUERIES, options.rounds)
+    count, rounds = (3, 1) if options.quick else (QUERIES, options.rounds)
     columns = ["case", "queries", "impacts", "most_advances"]
     columns += [f"{who}_us" for who in ("ours", *PEERS)] + [f"{peer}_to_ours" for peer in PEERS]
     columns += [f"{who}_{what}" for who in ("ours", *PEERS) for what in ("misses", "false_positives", "lost")]

@@ -35,7 +35,7 @@ import diffsim as ds
 from diffsim.viewer import Camera, Item, draw_items
 
 LENGTH, WIDTH, HEIGHT = 0.8, 0.1, 1.0  # of the strip, and of its clamp over the ground [m]
-NODES = (33, 5)  # along and across
+NODES, QUICK_NODES = (33, 5), (17, 3)  # along and across
 DENSITY, SHEAR, DAMPING = 0.2, 30.0, 0.02  # [kg/m²], [N/m], [s]
 GRAVITY = 9.81
 NOISE = 1.0e-3  # of each coordinate [m]
@@ -60,11 +60,12 @@ EXCESS = 0.1  # of the loss over its minimum: at most this part of CMA-ES's
 class Strip(torch.nn.Module):
     """From the logarithms of stretch and bend stiffness to where the nodes come to rest."""
 
-    def __init__(self) -> None:
+    def __init__(self, nodes: tuple[int, int] = NODES) -> None:
         super().__init__()
-        vertices, faces = ds.shapes.sheet((LENGTH, WIDTH), NODES)
+        self.nodes = nodes
+        vertices, faces = ds.shapes.sheet((LENGTH, WIDTH), nodes)
         vertices = vertices + np.array([0.5 * LENGTH, 0.0, 0.0])  # from x = 0
-        self.clamped = vertices[:, 0] < 1.01 * LENGTH / (NODES[0] - 1)  # two columns: place and direction
+        self.clamped = vertices[:, 0] < 1.01 * LENGTH / (nodes[0] - 1)  # two columns: place and direction
         material = ds.ClothMaterial(DENSITY, GUESS[0], SHEAR, GUESS[1], DAMPING)
         self.scene = ds.Scene(gravity=(0.0, 0.0, -GRAVITY))
         self.scene.add_cloth((vertices, faces), material, pinned=self.clamped, position=(0, 0, HEIGHT), name="strip")
@@ -195,17 +196,17 @@ def by_cma(problem: Problem, budget: int, tell: Callable[[], object], seed: int 
 # ---- checks ----------------------------------------------------------------------------------------------------------
 
 
-def read_off(nodes: Tensor) -> tuple[float, float]:
+def read_off(position: Tensor, nodes: tuple[int, int]) -> tuple[float, float]:
     """Stretch [N/m] and bend [N·m] of a resting strip by the elastica, from the mean over its width.
 
     What hangs below a section pulls at it: the tension is S (e + e²/2) (1 + e) for the strain e in St. Venant and
     Kirchhoff's law, and turns it: bend κ is the moment of the weight below. Each as the quotient of two integrals.
     """
-    across = np.full(NODES[1], 1.0)
+    across = np.full(nodes[1], 1.0)
     across[[0, -1]] = 0.5
-    grid = nodes.reshape(NODES[1], NODES[0], 3).numpy()
+    grid = position.reshape(nodes[1], nodes[0], 3).numpy()
     line = np.average(grid, axis=0, weights=across)[1:, [0, 2]]  # from the clamp's end
-    spacing = LENGTH / (NODES[0] - 1)
+    spacing = LENGTH / (nodes[0] - 1)
     edges = np.diff(line, axis=0)
     lengths = np.linalg.norm(edges, axis=1)
     strain = lengths / spacing - 1.0
@@ -248,7 +249,7 @@ def check(problem: Problem, gradient: Search, evolution: Search) -> bool:
     speed = float(resting.node_velocity[-1].norm(dim=1).max())
     results.append((f"the strip is at rest in the end: no node is faster than {speed:.1e} m/s", speed < RESTING))
     for name, read, true, bound in zip(
-        ("stretch", "bend"), read_off(resting.node_position[-1]), TRUTH, (STRETCH_READ, BEND_READ)
+        ("stretch", "bend"), read_off(resting.node_position[-1], strip.nodes), TRUTH, (STRETCH_READ, BEND_READ)
     ):
         off = abs(read / true - 1.0)
         text = f"{name} read off its shape by the elastica: {read:.4g}, {100.0 * off:.1f} % from the truth"
@@ -317,14 +318,14 @@ def draw(problem: Problem, searches: Sequence[Search], path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = make_parser(__doc__, "the same: it takes seconds", "of the noise, and of CMA-ES")
+    parser = make_parser(__doc__, f"{QUICK_NODES[0]} x {QUICK_NODES[1]} nodes", "of the noise, and of CMA-ES")
     parser.add_argument("--budget", type=int, default=BUDGET, help="simulations of each method (default: %(default)s)")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     budget = options.budget
-    strip = Strip()
+    strip = Strip(QUICK_NODES if options.quick else NODES)
     problem = observe(strip, TRUTH, options.seed)
-    print(f"{NODES[0]} x {NODES[1]} nodes, {STEPS} steps of {DT:g} s; {budget} simulations for each method")
+    print(f"{strip.nodes[0]} x {strip.nodes[1]} nodes, {STEPS} steps of {DT:g} s; {budget} simulations for each method")
     with tqdm(total=2 * budget, desc="simulations", unit="run") as bar:
         gradient = by_gradient(problem, budget, bar.update)
         evolution = by_cma(problem, budget, bar.update, options.seed + 1)
