@@ -35,7 +35,7 @@ RADIUS, GAP = 0.05, 0.1  # of both balls; between them at first [m]
 SCENES = 32  # per iteration, over all processes
 TESTS = 64  # scenes no network was trained on
 NEAREST, FARTHEST, WIDEST = 0.3, 0.8, math.radians(25.0)  # where targets are, seen from the ball that is struck
-RATE, ITERATIONS, QUICK_ITERATIONS = 0.01, 300, 150
+RATE, ITERATIONS, QUICK_ITERATIONS = 0.01, 300, 200
 
 FALL = 100.0  # the mean squared distance must fall by this
 HIT = 0.95  # part of the test scenes in which the ball must have been struck
