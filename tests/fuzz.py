@@ -50,6 +50,7 @@ MOST_FRICTION = 1.5
 class Outcome:
     problems: list[str]
     failed_steps: int
+    blocked_steps: int  # in which a moving body squeezes something: they cannot converge
     contacts: int  # in the last step
     seconds: float
     slowest: float  # step, relative to the median, in process time
@@ -213,17 +214,20 @@ def run_scene(
     for leaf in leaves.values():
         leaf.requires_grad_()
     control = ds.Control(force=force)
-    frames, times, failed, contacts = [state], [], 0, 0
+    frames, times, failed, blocked, contacts = [state], [], 0, 0, 0
     for step in range(1, steps + 1):
         begin = time.process_time()
         try:
             frames.append(sim(frames[-1], control))
         except ValueError as error:  # it refuses a state that it made itself
-            return Outcome([f"step {step}: {error}"], failed, contacts, time.perf_counter() - start, 0.0, 0.0, 0)
+            seconds = time.perf_counter() - start
+            return Outcome([f"step {step}: {error}"], failed, blocked, contacts, seconds, 0.0, 0.0, 0)
         times.append(time.process_time() - begin)
         assert sim.info is not None
         contacts = sim.info.contacts
-        if not sim.info.converged:
+        if any(failure.status == "blocked" for failure in sim.info.failures):
+            blocked += 1
+        elif not sim.info.converged:
             failed += 1
             if failures is not None:
                 save(frames[-2], failures, f"scene_{index}_before_step_{step}")
@@ -253,7 +257,7 @@ def run_scene(
     hold = differences.wrong_derivatives if regular else wrong_derivatives
     for step, frame in enumerate((frame.detach() for frame in frames[1:]), 1):
         found = [text for check in checks for text in check.problems(sim, frame)]
-        if every and step % every == 0:
+        if every and step % every == 0 and not blocked:  # such a body has no room to be moved for a difference
             with torch.no_grad():
                 sim(frame, ds.Control(force=force))
             if sim.info.converged:  # else the step ended short of what is differentiated
@@ -261,7 +265,7 @@ def run_scene(
                 derivatives += count
                 found += wrong
         problems += [f"after step {step}: {text}" for text in found]
-    return Outcome(problems, failed, contacts, seconds, slowest, largest, derivatives)
+    return Outcome(problems, failed, blocked, contacts, seconds, slowest, largest, derivatives)
 
 
 def main() -> int:
@@ -278,7 +282,7 @@ def main() -> int:
     parser.add_argument("--failures", type=Path, help="directory for the states before steps that do not converge")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", ds.ConvergenceWarning)  # they are counted instead
-    bad, failed, unconverged_scenes, slow, derivatives, begin = 0, 0, 0, 0, 0, time.perf_counter()
+    bad, failed, blocked, unconverged_scenes, slow, derivatives, begin = 0, 0, 0, 0, 0, 0, time.perf_counter()
     for index in range(arguments.first, arguments.first + arguments.scenes):
         if arguments.regular:
             scene = regular_scene(arguments.seed, index)
@@ -296,12 +300,14 @@ def main() -> int:
         derivatives += outcome.derivatives
         bad += bool(outcome.problems)
         failed += outcome.failed_steps
+        blocked += outcome.blocked_steps
         unconverged_scenes += outcome.failed_steps > 0
         slow += outcome.slowest > SLOW
         print(
             f"scene {index}: {outcome.seconds:.2f} s, {outcome.contacts} contacts at the end, largest gradient"
             f" {outcome.gradient:.1e}, slowest step {outcome.slowest:.0f} medians{' (!)' * (outcome.slowest > SLOW)},"
-            f" {outcome.failed_steps} steps did not converge, {len(outcome.problems)} problems",
+            f" {outcome.failed_steps} steps did not converge, {outcome.blocked_steps} blocked,"
+            f" {len(outcome.problems)} problems",
             flush=True,
         )
         for text in outcome.problems[:5]:
@@ -309,8 +315,8 @@ def main() -> int:
     print(
         f"{arguments.scenes} scenes of {'regular' if arguments.regular else arguments.bodies} bodies and"
         f" {arguments.steps} steps in {time.perf_counter() - begin:.0f} s: {bad} scenes with problems; {failed} of"
-        f" {arguments.scenes * arguments.steps} steps in {unconverged_scenes} scenes did not converge;"
-        f" a step took more than {SLOW:.0f} medians in {slow} scenes;"
+        f" {arguments.scenes * arguments.steps} steps in {unconverged_scenes} scenes did not converge,"
+        f" {blocked} were blocked; a step took more than {SLOW:.0f} medians in {slow} scenes;"
         f" {derivatives} derivatives held against differences"
     )
     return 1 if bad else 0
