@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -84,6 +85,20 @@ def ball_on_a_sheet(scene: ds.Scene) -> None:
     scene.add_sphere(0.08, density=300.0, position=(-0.07, 0.02, 0.59), friction=0.4, **motion)
 
 
+def figurine_on_a_sheet(scene: ds.Scene) -> None:
+    scene.add_cloth(
+        ds.shapes.sheet(0.6, 5),
+        ds.ClothMaterial.isotropic(young=1e5, thickness=2e-3, density=300.0, poisson=0.3, damping=1e-3),
+        pinned=[0, 4, 20, 24],
+        position=(0.0, 0.0, 0.5),
+        friction=0.5,
+    )
+    vertices, faces = ds.shapes.icosphere(0.1, 1)
+    vertices *= 1.0 + 0.3 * np.cos(40.0 * vertices.sum(axis=1, keepdims=True))  # bumps and hollows
+    motion: dict[str, Any] = {"velocity": (0.6, 0.2, -0.5), "angular_velocity": (1.0, 0.0, 2.0)}
+    scene.add_body((vertices, faces), density=300.0, position=(-0.07, 0.02, 0.62), friction=0.4, **motion)
+
+
 def simulator(build: Callable[[ds.Scene], None], **options: Any) -> ds.Simulator:
     scene = ds.Scene()
     build(scene)
@@ -100,7 +115,15 @@ def assert_right(report: GradcheckReport, least: int) -> None:
 
 @pytest.mark.parametrize(
     "build",
-    [slides_to_rest, angle_tumbles, ball_rolls_off_a_box, stack_is_hit, sheet_on_a_box, ball_on_a_sheet],
+    [
+        slides_to_rest,
+        angle_tumbles,
+        ball_rolls_off_a_box,
+        stack_is_hit,
+        sheet_on_a_box,
+        ball_on_a_sheet,
+        figurine_on_a_sheet,
+    ],
     ids=lambda build: build.__name__,
 )
 def test_gradients_are_central_differences(build: Callable[[ds.Scene], None]) -> None:
