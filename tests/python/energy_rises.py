@@ -16,7 +16,6 @@ from torch import Tensor
 
 import diffsim as ds
 
-HIGHER = 1.5  # what terms of higher order may add, as a factor
 ROUNDING = 1e-9  # of the energy there is
 
 
@@ -33,7 +32,7 @@ def rises_of_energy(sim: ds.Simulator, frames: list[ds.State], control: ds.Contr
     found = []
     for k in (rise > rounding).nonzero().flatten().tolist():
         with torch.no_grad():
-            room = rounding[k] + HIGHER * by_curved_motion(sim, sim.contacts(frames[k].detach(), control))
+            room = rounding[k] + by_curved_motion(sim, sim.contacts(frames[k].detach(), control))
             if k > 0:
                 room = room + in_contacts(sim, sim.contacts(frames[k - 1].detach(), control))
         if rise[k] > room:
