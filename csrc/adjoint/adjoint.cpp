@@ -5,11 +5,11 @@
 #include <algorithm>
 #include <utility>
 
-#include "adjoint/contact_term.hpp"
 #include "adjoint/friction_adjoint.hpp"
 #include "adjoint/linearised_zone.hpp"
 #include "math/rotation.hpp"
 #include "zone/chart.hpp"
+#include "zone/contact_term.hpp"
 #include "zone/elasticity.hpp"
 #include "zone/sides_of.hpp"
 

@@ -2,7 +2,6 @@
 
 #include <cmath>
 
-#include "zone/chart.hpp"
 #include "zone/gmres.hpp"
 
 namespace diffsim {
@@ -22,44 +21,9 @@ FrictionAdjoint::FrictionAdjoint(const Zone& zone, const ZonePoint& point, const
         if (!(zone.contacts.law(static_cast<std::size_t>(active.index)).friction > 0.0)) continue;
         if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
         Term& term = m_terms.emplace_back();
-        static_cast<FrictionTerm&>(term) = friction_term(zone, point, active, friction[k]);
+        static_cast<FrictionTerm&>(term) = friction_term(zone, point, active.index, active.geometry, friction[k]);
         term.contact = active.index;
-        // From places to coordinates.
-        term.changes = term.force_of_place;
-        term.slip = term.slip_of_place;
-        term.for_each(
-            [&](int body, int offset) {
-                if (!zone.yields(body)) return;
-                const Mat6 chart = chart_jacobian(point.y.bodies[body]);
-                term.changes.middleCols<6>(offset) = (term.changes.middleCols<6>(offset) * chart).eval();
-                if (term.sticks) term.slip.middleCols<6>(offset) = (term.slip.middleCols<6>(offset) * chart).eval();
-            },
-            [](int, int) {});
-        term.changes += term.force_of_motion;
-        if (term.sticks) term.slip += term.slip_of_motion;
     }
-}
-
-SmallVector FrictionAdjoint::gather(const Term& term, const Coordinates& z) const {
-    SmallVector result = SmallVector::Zero(term.changes.rows());
-    term.for_each(
-        [&](int body, int offset) {
-            if (m_zone.yields(body)) result.segment<6>(offset) = z.bodies[body];
-        },
-        [&](int node, int offset) {
-            if (!m_zone.nodes[node].pinned) result.segment<3>(offset) = z.nodes[node];
-        });
-    return result;
-}
-
-void FrictionAdjoint::scatter(const Term& term, double factor, const SmallVector& v, Coordinates& sum) const {
-    term.for_each(
-        [&](int body, int offset) {
-            if (m_zone.yields(body)) sum.bodies[body] += factor * v.segment<6>(offset);
-        },
-        [&](int node, int offset) {
-            if (!m_zone.nodes[node].pinned) sum.nodes[node] += factor * v.segment<3>(offset);
-        });
 }
 
 void FrictionAdjoint::add_symmetric(const Term& term, const SmallMatrix& matrix, BlockSystem& system) const {
@@ -104,7 +68,8 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
         Coordinates result;
         result.assign_zero(x.bodies.size(), x.nodes.size());
         for (const Term& term : m_terms)
-            scatter(term, 1.0, SmallVector(term.beyond.transpose().lazyProduct(gather(term, x))), result);
+            scatter(
+                m_zone, term, 1.0, SmallVector(term.beyond.transpose().lazyProduct(gather(m_zone, term, x))), result);
         system.solve_in_place(result);
         add(1.0, x, result);
         return result;
@@ -113,12 +78,13 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
     for (int round = 0; round < (sticks ? kMultiplierRounds : 1); ++round) {
         z = upstream;
         for (const Term& term : m_terms)
-            if (term.sticks) scatter(term, -1.0, SmallVector(term.slip.transpose() * term.multiplier), z);
+            if (term.sticks) scatter(m_zone, term, -1.0, SmallVector(term.slip.transpose() * term.multiplier), z);
         system.solve_in_place(z);
         gmres(m_zone, apply, kLinearTolerance, kMaxLinear, z);
         for (Term& term : m_terms)
             if (term.sticks)
-                term.multiplier += kStickStiffening * term.stiffness * (term.rows.transpose() * gather(term, z));
+                term.multiplier +=
+                    kStickStiffening * term.stiffness * (term.rows.transpose() * gather(m_zone, term, z));
     }
     return true;
 }
@@ -126,16 +92,16 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
 Coordinates FrictionAdjoint::left_by_friction(const Coordinates& upstream, const Coordinates& z) const {
     Coordinates left = upstream;
     for (const Term& term : m_terms) {
-        SmallVector taken = term.changes.transpose() * gather(term, z);
+        SmallVector taken = term.changes.transpose() * gather(m_zone, term, z);
         if (term.sticks) taken += term.slip.transpose() * term.multiplier;
-        scatter(term, -1.0, taken, left);
+        scatter(m_zone, term, -1.0, taken, left);
     }
     return left;
 }
 
 void FrictionAdjoint::add_gradients(const Coordinates& z, ZoneAdjoint& result) const {
     for (const Term& term : m_terms) {
-        const SmallVector along = gather(term, z);
+        const SmallVector along = gather(m_zone, term, z);
         SmallVector place = term.force_of_place.transpose() * along, motion = term.force_of_motion.transpose() * along;
         if (term.sticks) {
             place += term.slip_of_place.transpose() * term.multiplier;

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "adjoint/adjoint.hpp"
-#include "adjoint/friction_term.hpp"
+#include "zone/friction_term.hpp"
 
 /// Friction in the backward of a zone.
 ///
@@ -32,15 +32,11 @@ public:
 
 private:
     struct Term : FrictionTerm {
-        int contact = 0;                                          ///< index into Zone::contacts
-        SmallMatrix changes;                                      ///< d(Jᵀ λ)/dy
-        Eigen::Matrix<double, 2, Eigen::Dynamic, 0, 2, 18> slip;  ///< d(slip)/dy
-        SmallMatrix beyond;                                       ///< what the system lacks of them all
-        Eigen::Vector2d multiplier = Eigen::Vector2d::Zero();     ///< ζ
+        int contact = 0;                                       ///< index into Zone::contacts
+        SmallMatrix beyond;                                    ///< what the system lacks of it
+        Eigen::Vector2d multiplier = Eigen::Vector2d::Zero();  ///< ζ
     };
 
-    SmallVector gather(const Term& term, const Coordinates& z) const;
-    void scatter(const Term& term, double factor, const SmallVector& v, Coordinates& sum) const;
     void add_symmetric(const Term& term, const SmallMatrix& matrix, BlockSystem& system) const;
 
     const Zone& m_zone;

@@ -5,8 +5,8 @@
 #include <Eigen/QR>
 #include <optional>
 
-#include "adjoint/contact_term.hpp"
 #include "zone/chart.hpp"
+#include "zone/contact_term.hpp"
 #include "zone/elasticity.hpp"
 
 namespace diffsim {

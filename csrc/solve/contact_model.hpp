@@ -1,16 +1,24 @@
 #pragma once
 
 #include "zone/friction_row.hpp"
+#include "zone/friction_term.hpp"
 
 /// The convex model of a zone around its current point, all near contacts in it:
 ///     m(p) = ½ pᵀ H p + gᵀ p + Σ stiffness/2 max(0, missing - rowᵀ p)².
 namespace diffsim {
+
+/// What rows do not see of a contact with friction: as it turns, its force and its slip turn with it.
+struct FrictionTurn : FrictionTerm {
+    std::size_t friction;  ///< index into ContactModel::friction
+    SlipChanges beyond;    ///< what its slip changes by, without the rows
+};
 
 struct ContactModel {
     BlockSystem smooth;                 ///< H; its pattern has the rows' pairs
     Coordinates gradient;               ///< g; zero at pinned nodes
     std::vector<ContactRow> rows;       ///< one-sided; those of the same bodies follow each other
     std::vector<FrictionRow> friction;  ///< of rows whose contacts have some, in their order; see friction_model
+    std::vector<FrictionTurn> turns;    ///< of some of them
 };
 
 /// Memory of minimise(), kept from model to model.

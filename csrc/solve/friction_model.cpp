@@ -10,7 +10,8 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxBalanceSteps = 100;
-constexpr int kFreezeAfter = 10;      // Newton steps before bounds are kept from following
+constexpr int kCrawlAfter =
+    10;  // Newton steps before the model gets simpler: without turns, then with bounds that stay
 constexpr double kBoundChange = 0.1;  // of the largest: bounds that change less may follow again
 constexpr int kMaxFrozenRounds = 10;  // of bounds that stand still
 constexpr int kMaxBisections = 30;    // bisections of a line search
@@ -18,6 +19,7 @@ constexpr double kFlat = 0.1;         // of the slope at the start: that at the 
 constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
+constexpr double kSlipShare = 0.1;      // of what a bound presses its contact by: FrictionRow::reach
 constexpr double kSettledReach = 0.01;  // of its slip
 constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
 
@@ -33,9 +35,10 @@ public:
           m_w(workspace),
           m_p(p) {}
 
-    ModelSolution run(double tolerance, const SlipScale& scale) {
-        set_reach(scale);
+    ModelSolution run(double tolerance, bool is_settled) {
+        set_reach(is_settled);
         look();
+        const Coordinates start = m_p;
         if (!keep_states()) return m_result;
         int rounds = 0;
         for (int steps = 0;; ++steps) {
@@ -50,9 +53,16 @@ public:
             }
             m_result.status = left <= tolerance ? ModelSolution::Status::solved : ModelSolution::Status::crawling;
             if (left <= tolerance || m_result.newton_steps >= kMaxBalanceSteps) break;
-            if (!m_frozen && steps >= kFreezeAfter) {
-                m_frozen = true;
-                rounds = 0;
+            if (!m_frozen && steps >= kCrawlAfter) {
+                if (m_model.turns.empty()) {
+                    m_frozen = true;
+                    rounds = 0;
+                } else {
+                    m_model.turns.clear();
+                    m_p = start;
+                    steps = -1;
+                    continue;
+                }
             }
             if (!newton_step()) {
                 m_result.status = ModelSolution::Status::indefinite;
@@ -67,7 +77,7 @@ private:
     double force(std::size_t r) const { return m_rows[r].stiffness * std::max(0.0, m_w.violation[r]); }
 
     /// Proportional to the load: then all contacts of a face come to their bounds together.
-    void set_reach(const SlipScale& scale) {
+    void set_reach(bool is_settled) {
         std::size_t f = 0;
         visit_runs(m_rows, [&](std::size_t first, std::size_t last) {
             double sum = 0.0;
@@ -81,9 +91,9 @@ private:
                 FrictionRow& slip = m_friction[f];
                 const ContactRow& row = m_rows[slip.normal];
                 const double pressed = count > 0 ? sum / count / row.stiffness : row.range;
-                slip.reach = scale.share * slip.coefficient * pressed;
+                slip.reach = kSlipShare * slip.coefficient * pressed;
                 const double size = slip.slip.norm();
-                if (scale.is_settled && slip.slips && size > kRestingSlip)
+                if (is_settled && slip.slips && size > kRestingSlip)
                     slip.reach = std::min(slip.reach, kSettledReach * size);
                 if (slip.is_known) continue;
                 slip.slips = size > slip.reach;
@@ -100,6 +110,11 @@ private:
         slips_times(m_friction, m_rows, m_p, m_w.slip);
         for (std::size_t f = 0; f < m_friction.size(); ++f)
             m_w.slip[f] += m_friction[f].slip + m_friction[f].reach * m_friction[f].multiplier;
+        for (const FrictionTurn& turn : m_model.turns) {
+            const SmallVector q = gather(m_zone, turn, m_p);
+            m_w.slip[turn.friction] += turn.beyond * q;
+            scatter(m_zone, turn, 1.0, turn.changes * q, m_w.smooth_p);
+        }
     }
 
     /// Who pushes and who slips at p, and the balance there.
@@ -179,28 +194,37 @@ private:
         }
     }
 
-    /// What a motion changes the bounds by, as forces: N x.
-    Coordinates change_bounds(const Coordinates& x) {
+    /// N x: what a motion changes by forces besides what S says of it. Bounds follow, and contacts turn.
+    Coordinates left_out(const Coordinates& x) {
         Coordinates result;
         result.assign_zero(x.bodies.size(), x.nodes.size());
         rows_times(m_rows, x, m_w.slope);
         for (std::size_t f = 0; f < m_friction.size(); ++f) {
             const FrictionRow& slip = m_friction[f];
-            if (!(m_w.bound[f] > 0.0)) continue;
+            if (m_frozen || !(m_w.bound[f] > 0.0)) continue;
             const double change = slip.coefficient * m_rows[slip.normal].stiffness * m_w.slope[slip.normal];
             diffsim::add_friction(slip, m_rows[slip.normal], change * slip.share, result);
+        }
+        for (const FrictionTurn& turn : m_model.turns) {
+            const SmallVector q = gather(m_zone, turn, x);
+            const std::size_t f = turn.friction;
+            const Vec2& u = m_friction[f].share;
+            Vec2 w = turn.beyond * q;
+            if (m_friction[f].slips) w -= u * u.dot(w);
+            const double k = m_w.bound[f] / std::max(m_w.slip[f].norm(), m_friction[f].reach);
+            scatter(m_zone, turn, -1.0, turn.changes * q + turn.rows * (k * w), result);
         }
         return result;
     }
 
-    /// The Newton step, by S alone or with what it changes the bounds by.
+    /// The Newton step, by S alone or with bounds that follow.
     void solve_step(bool with_bounds) {
         m_w.step = m_w.gradient;
         scale(-1.0, m_w.step);
         m_system.solve_in_place(m_w.step);
-        if (!with_bounds) return;
+        if (!with_bounds && m_model.turns.empty()) return;
         const auto apply = [&](const Coordinates& x) {
-            Coordinates result = change_bounds(x);
+            Coordinates result = left_out(x);
             m_system.solve_in_place(result);
             scale(-1.0, result);
             add(1.0, x, result);
@@ -254,7 +278,7 @@ private:
                 if (bound[f] > 0.0)
                     bound[f] = slip.coefficient * m_rows[r].stiffness * std::max(0.0, m_w.violation[r] - m_w.slope[r]);
             }
-            if (slope(0.0, bound) > 0.0) {  // with these bounds it leads up
+            if (m_model.turns.empty() && slope(0.0, bound) > 0.0) {  // with these bounds it leads up
                 bound = m_w.bound;
                 solve_step(false);
                 measure_step();
@@ -268,6 +292,11 @@ private:
         rows_times(m_rows, m_w.step, m_w.slope);
         slips_times(m_friction, m_rows, m_w.step, m_w.slip_step);
         m_model.smooth.multiply(m_w.step, m_w.smooth_step);
+        for (const FrictionTurn& turn : m_model.turns) {
+            const SmallVector q = gather(m_zone, turn, m_w.step);
+            m_w.slip_step[turn.friction] += turn.beyond * q;
+            scatter(m_zone, turn, 1.0, turn.changes * q, m_w.smooth_step);
+        }
         m_first = dot(m_w.step, m_model.gradient) + dot(m_w.step, m_w.smooth_p);
         m_second = dot(m_w.step, m_w.smooth_step);
     }
@@ -318,9 +347,9 @@ private:
 }  // namespace
 
 ModelSolution balance(
-    ContactModel& model, const Zone& zone, double tolerance, const SlipScale& scale, BlockSystem& system,
+    ContactModel& model, const Zone& zone, double tolerance, bool is_settled, BlockSystem& system,
     BalanceWorkspace& workspace, Coordinates& p) {
-    return Balance(model, zone, system, workspace, p).run(tolerance, scale);
+    return Balance(model, zone, system, workspace, p).run(tolerance, is_settled);
 }
 
 }  // namespace diffsim

@@ -10,7 +10,7 @@
 /// The bound follows the force inside the model, so that this is no minimum: the solution of
 ///     H p + g - Σ force row + Σ rows_s μ force u = 0
 /// is found by Newton's method, whose matrix S - N is not symmetric: S is what it is for bounds that stay as they are, N what
-/// they change by. GMRES with the factor of S solves with it.
+/// they change by. GMRES with the factor of S solves with it, and with what S leaves out of contacts that turn.
 namespace diffsim {
 
 /// Memory of balance(), kept from model to model.
@@ -21,17 +21,12 @@ struct BalanceWorkspace {
     std::vector<Vec2> slip, slip_step, pull;
 };
 
-/// How the slip of contacts is regularised; see FrictionRow::reach.
-struct SlipScale {
-    double share = 0.1;       ///< of what a bound presses its contact by
-    bool is_settled = false;  ///< contacts that slip go on: their direction is made exact
-};
-
 /// Solve until no more than `tolerance` is left of the balance, in units of |L⁻¹ g|. `p` holds the start, which pinned nodes
-/// keep, and receives the solution; rows receive their forces and states. Scratch: `system`, whose pattern is that of
+/// keep, and receives the solution; rows receive their forces and states. `is_settled`: contacts that slip go on, and their
+/// direction is made exact. Scratch: `system`, whose pattern is that of
 /// model.smooth.
 ModelSolution balance(
-    ContactModel& model, const Zone& zone, double tolerance, const SlipScale& scale, BlockSystem& system,
+    ContactModel& model, const Zone& zone, double tolerance, bool is_settled, BlockSystem& system,
     BalanceWorkspace& workspace, Coordinates& p);
 
 }  // namespace diffsim

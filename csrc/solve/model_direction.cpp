@@ -119,7 +119,7 @@ void ModelDirection::add_near(int index, const ContactGeometry& geometry) {
     if (compression > 0.0) {
         const PotentialValue push = normal_force(contact.law, geometry.distance);
         stiffness = push.force / compression;
-        if (m_goal.is_near) {
+        if (m_goal.is_settled) {
             stiffness = push.stiffness;
             wanted = geometry.distance + push.force / push.stiffness;
         }
@@ -165,10 +165,12 @@ void ModelDirection::make_model() {
     m_model.gradient = *m_gradient;
     m_model.rows.clear();
     m_model.friction.clear();
+    m_model.turns.clear();
     m_at.y = m_point.y;
     m_at.poses = m_point.poses;
     m_at.nodes = m_point.nodes;
     for (const NearContact& near : m_near) make_start_row(near);
+    if (m_goal.turns) add_turns();
     if (!with_nodes || !m_zone.elastic) return;
     std::vector<Vec3> driven(m_zone.nodes.size(), Vec3::Zero());
     bool any = false;
@@ -204,7 +206,8 @@ void ModelDirection::make_start_row(const NearContact& near) {
 /// few steps each.
 bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
     if (!m_model.friction.empty()) {
-        const ModelSolution balanced = balance(m_model, m_zone, m_goal.tolerance, m_goal.scale, m_system, m_balance, p);
+        const ModelSolution balanced =
+            balance(m_model, m_zone, m_goal.tolerance, m_goal.is_settled, m_system, m_balance, p);
         newton_steps += balanced.newton_steps;
         m_right_guess = balanced.newton_steps == 1;
         return balanced.status != ModelSolution::Status::indefinite;
@@ -293,6 +296,7 @@ void ModelDirection::linearise_at(const Coordinates& y_end, const std::vector<Im
         m_friction[static_cast<std::size_t>(m_model.rows[slip.normal].contact)] = slip.state();
     m_model.rows.clear();
     m_model.friction.clear();
+    m_model.turns.clear();
     m_at.y = y_end;
     place(m_zone, y_end, m_at.poses, m_at.nodes);
     auto impact = impacts.begin();

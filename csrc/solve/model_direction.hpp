@@ -30,14 +30,16 @@ public:
     /// What a solution with friction is asked for.
     struct BalanceGoal {
         double tolerance = 0.0;  ///< of the model's balance, in units of |L⁻¹ g|
-        SlipScale scale;
-        /// Compressed contacts have their stiffness, not the secant's: the model is then Newton's, but for what turns.
-        bool is_near = false;
+        /// Contacts mostly go on as in the last model. Compressed ones have their stiffness, not the secant's.
+        bool is_settled = false;
+        bool turns = false;  ///< what rows do not see of contacts with friction is in the model, too; see FrictionTurn
     };
     void aim_for(const BalanceGoal& goal) { m_goal = goal; }
 
     /// Add what friction does at the point, its contacts' shares of their bounds being those of the last model.
     void add_friction_forces(Coordinates& gradient);
+    /// Of contacts that push at the point, as a motion; see largest_motion().
+    double largest_slip() const;
     /// What friction takes up on this part of the last way, its bounds those of the last model.
     double friction_work(double step) const;
     /// The states of the last model, one per contact of the zone.
@@ -84,6 +86,7 @@ private:
     void make_model();
     void make_start_row(const NearContact& near);
     void add_friction_row(const NearContact& near, const ContactGeometry& geometry);
+    void add_turns();
     void advance_multipliers();
     bool solve(Coordinates& p, int& newton_steps);
     bool turns_too_far(const Coordinates& p);

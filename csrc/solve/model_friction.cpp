@@ -1,4 +1,8 @@
+#include <algorithm>
+#include <cmath>
+
 #include "solve/model_direction.hpp"
+#include "zone/sides_of.hpp"
 
 /// What friction adds to the models of a zone.
 namespace diffsim {
@@ -27,6 +31,27 @@ void ModelDirection::add_friction_forces(Coordinates& gradient) {
     }
 }
 
+double ModelDirection::largest_slip() const {
+    const Placement at{m_point.y, m_point.poses, m_point.nodes};
+    double largest = 0.0;
+    for (const ActiveContact& active : m_point.active) {
+        const ZoneContact& contact = m_zone.contacts[active.index];
+        if (!(contact.law.friction > 0.0) || active.geometry.sine_sq == 0.0) continue;
+        double mass = 0.0;
+        visit_movers(
+            m_zone, contact,
+            [&](int body) {
+                if (m_zone.yields(body)) mass = std::max(mass, m_zone.bodies[body].mass);
+            },
+            [&](int node) {
+                if (!m_zone.nodes[node].pinned) mass = std::max(mass, m_zone.nodes[node].mass);
+            });
+        const FrictionRow slip = make_friction_row(m_zone, contact, active.geometry, at, at.y);
+        largest = std::max(largest, std::sqrt(mass) * slip.slip.norm());
+    }
+    return largest;
+}
+
 double ModelDirection::friction_work(double step) const {
     const auto energy = [](const Vec2& slip, double reach) {
         const double size = slip.norm();
@@ -52,6 +77,20 @@ void ModelDirection::add_friction_row(const NearContact& near, const ContactGeom
     slip.normal = m_model.rows.size() - 1;
     slip.set_state(m_friction[static_cast<std::size_t>(near.contact)]);
     m_model.friction.push_back(std::move(slip));
+}
+
+void ModelDirection::add_turns() {
+    for (std::size_t f = 0; f < m_model.friction.size(); ++f) {
+        const FrictionRow& slip = m_model.friction[f];
+        const NearContact& near = m_near[slip.normal];
+        if (!slip.is_known || !(m_model.rows[slip.normal].force > 0.0)) continue;
+        FrictionTurn& turn = m_model.turns.emplace_back();
+        const FrictionState& state = m_friction[static_cast<std::size_t>(near.contact)];
+        static_cast<FrictionTerm&>(turn) =
+            friction_term(m_zone, m_point, near.contact, near.geometry, {state.share, false});
+        turn.friction = f;
+        turn.beyond = turn.slip - turn.rows.transpose();
+    }
 }
 
 }  // namespace diffsim

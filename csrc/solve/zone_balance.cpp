@@ -8,12 +8,11 @@ namespace diffsim {
 namespace {
 
 constexpr double kSettled = 1e-2;        // residual below which contacts mostly go on sticking or slipping
-constexpr double kSlipSettled = 1e-3;    // the same: from there on what is left is the multipliers'
-constexpr double kSettledShare = 3e-3;   // SlipScale::share, then
+constexpr double kTurning = 0.1;         // the same below which models see how contacts turn
 constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are solved
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
 constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is known of the last model's bounds alone
-constexpr double kRest = 1e-10;  // of the forces: a model that moves nothing further has found the balance
+constexpr double kRest = 1e-12;  // of the forces: a model that moves nothing further has found the balance
 constexpr int kStandsStill = 6;  // models in balance without halving their motion
 
 class BalanceSearch {
@@ -27,6 +26,7 @@ public:
             const Accuracy now = look();
             if (m_search.m_result.iterations >= m_search.m_options.max_iterations)
                 return m_search.fail(ZoneStatus::too_many_iterations);
+            if (m_search.m_result.iterations == 0 && driven && rests(now)) return;
             const ModelDirection::Way way = m_model.find(m_w.derivatives.gradient, driven, m_w.y_end);
             if (!way.found) return m_search.fail(ZoneStatus::no_descent);
             const double motion = motion_to_end();
@@ -62,11 +62,13 @@ private:
         m_search.m_result.residual = now.residual;
         m_wanted = std::max(m_search.m_options.tolerance, now.floor);
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
-        m_scale.is_settled = now.residual < kSettled;
-        // Stiffer springs leave less to multipliers, which are slow where sticking works against other contacts' springs.
-        m_scale.share = now.residual < kSlipSettled ? kSettledShare : SlipScale().share;
-        m_model.aim_for({tolerance * now.reference, m_scale, m_scale.is_settled});
+        m_model.aim_for({tolerance * now.reference, now.residual < kSettled, now.residual < kTurning});
         return now;
+    }
+
+    /// Whether the point is the solution, with contacts that do not slip and that nothing pulls at.
+    bool rests(const Accuracy& now) const {
+        return now.residual < m_wanted && m_model.largest_slip() <= kRest * now.reference;
     }
 
     /// Of the way to y_end.
@@ -106,7 +108,6 @@ private:
     ModelDirection& m_model;
     ZoneWorkspace& m_w;
     Coordinates m_balance;  // what is left of it
-    SlipScale m_scale;
     double m_wanted = 0.0;  // the residual asked for
     double m_least_motion = kInfinity;
     int m_stalls = 0, m_damped = 0, m_still = 0;

@@ -3,7 +3,7 @@
 #include "zone/sides_of.hpp"
 #include "zone/zone_derivatives.hpp"
 
-/// What the backward of a zone needs of each active contact.
+/// The derivatives of one contact, by itself.
 namespace diffsim {
 
 /// Vectors and matrices of up to two features of cloth, on the stack.
@@ -50,6 +50,33 @@ struct ContactTerm {
 inline void set_side(ContactTerm::Side& side, const PlacedSide<BodySide>& placed) { side.body = placed.body; }
 inline void set_side(ContactTerm::Side& side, const PlacedSide<ClothSide>& placed) { side.nodes = placed.nodes; }
 inline void set_side(ContactTerm::Side&, const PlacedSide<GroundSide>&) {}
+
+/// The coordinates of what a term is taken along; zero where it does not yield.
+template <class Term>
+SmallVector gather(const Zone& zone, const Term& term, const Coordinates& z) {
+    const ContactTerm::Side& last = term.sides[static_cast<std::size_t>(term.side_count - 1)];
+    SmallVector result = SmallVector::Zero(last.offset + (last.body >= 0 ? 6 : 9));
+    term.for_each(
+        [&](int body, int offset) {
+            if (zone.yields(body)) result.segment<6>(offset) = z.bodies[body];
+        },
+        [&](int node, int offset) {
+            if (!zone.nodes[node].pinned) result.segment<3>(offset) = z.nodes[node];
+        });
+    return result;
+}
+
+/// sum += factor * v, back where gather() takes it from.
+template <class Term>
+void scatter(const Zone& zone, const Term& term, double factor, const SmallVector& v, Coordinates& sum) {
+    term.for_each(
+        [&](int body, int offset) {
+            if (zone.yields(body)) sum.bodies[body] += factor * v.segment<6>(offset);
+        },
+        [&](int node, int offset) {
+            if (!zone.nodes[node].pinned) sum.nodes[node] += factor * v.segment<3>(offset);
+        });
+}
 
 /// The derivatives of one active contact. Curvature::none leaves the Hessian unset, which of a body on the ground it
 /// always is.

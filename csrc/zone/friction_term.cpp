@@ -1,10 +1,11 @@
-#include "adjoint/friction_term.hpp"
+#include "zone/friction_term.hpp"
 
 #include <Eigen/Geometry>
 #include <Eigen/LU>
 #include <type_traits>
 
 #include "math/rotation.hpp"
+#include "zone/chart.hpp"
 
 namespace diffsim {
 namespace {
@@ -148,14 +149,9 @@ Changes find_changes(const ContactGeometry& geometry, const ContactLaw& law, con
 class TermMaker {
 public:
     TermMaker(
-        const Zone& zone, const ZonePoint& point, const ActiveContact& active, const ContactFriction& friction,
-        FrictionTerm& term)
-        : m_zone(zone),
-          m_point(point),
-          m_geometry(active.geometry),
-          m_contact(zone.contacts[active.index]),
-          m_friction(friction),
-          m_term(term) {}
+        const Zone& zone, const ZonePoint& point, const ZoneContact& contact, const ContactGeometry& geometry,
+        const ContactFriction& friction, FrictionTerm& term)
+        : m_zone(zone), m_point(point), m_geometry(geometry), m_contact(contact), m_friction(friction), m_term(term) {}
 
     template <class A, class B>
     void make(const PlacedSide<A>& placed_a, const PlacedSide<B>& placed_b) {
@@ -309,12 +305,25 @@ private:
 }  // namespace
 
 FrictionTerm friction_term(
-    const Zone& zone, const ZonePoint& point, const ActiveContact& active, const ContactFriction& friction) {
+    const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
+    const ContactFriction& friction) {
     FrictionTerm term;
-    TermMaker maker(zone, point, active, friction, term);
+    TermMaker maker(zone, point, zone.contacts[contact], geometry, friction, term);
     with_placed_sides(
-        zone, zone.contacts[active.index], active.geometry, point.poses, point.nodes,
+        zone, zone.contacts[contact], geometry, point.poses, point.nodes,
         [&](const auto& a, const auto& b) { maker.make(a, b); });
+    term.changes = term.force_of_place;
+    term.slip = term.slip_of_place;
+    term.for_each(
+        [&](int body, int offset) {
+            if (!zone.yields(body)) return;
+            const Mat6 chart = chart_jacobian(point.y.bodies[body]);
+            term.changes.middleCols<6>(offset) = (term.changes.middleCols<6>(offset) * chart).eval();
+            if (term.sticks) term.slip.middleCols<6>(offset) = (term.slip.middleCols<6>(offset) * chart).eval();
+        },
+        [](int, int) {});
+    term.changes += term.force_of_motion;
+    if (term.sticks) term.slip += term.slip_of_motion;
     return term;
 }
 

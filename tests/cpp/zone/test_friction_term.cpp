@@ -1,4 +1,4 @@
-#include "adjoint/friction_term.hpp"
+#include "zone/friction_term.hpp"
 
 #include <cmath>
 
@@ -60,7 +60,9 @@ struct Boxes {
         collect_contacts(zone, PassiveBodies(), begin, end, coverage);
         evaluate(zone, point);
     }
-    FrictionTerm term() const { return friction_term(zone, point, point.active.front(), state); }
+    FrictionTerm term() const {
+        return friction_term(zone, point, point.active.front().index, point.active.front().geometry, state);
+    }
 
     /// The same with a body elsewhere, moved as it was: by a twist at its end.
     Boxes placed(int coordinate, double by) const {

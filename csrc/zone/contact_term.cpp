@@ -1,4 +1,4 @@
-#include "adjoint/contact_term.hpp"
+#include "zone/contact_term.hpp"
 
 namespace diffsim {
 namespace {

@@ -1,10 +1,12 @@
 #pragma once
 
-#include "adjoint/contact_term.hpp"
 #include "contact/friction.hpp"
+#include "zone/contact_term.hpp"
 
-/// What the backward of a zone needs of each contact with friction.
+/// How the friction of one contact changes with where its sides are and how they have moved.
 namespace diffsim {
+
+using SlipChanges = Eigen::Matrix<double, 2, Eigen::Dynamic, 0, 2, 18>;
 
 /// Friction of one contact at the solution. Its forces on the coordinates of both sides, Jᵀ λ with λ the force that holds a back,
 /// change with where the sides are and with how they have moved during the step:
@@ -16,9 +18,11 @@ struct FrictionTerm {
     bool sticks = false;
     // Derivatives along the sides' places (twists, nodes) and their motions (y): columns; rows as the coordinates y.
     SmallMatrix force_of_place, force_of_motion;
+    // Along y, with which places move: both together.
+    SmallMatrix changes;
     // Sticking: the two tangential directions as forces, and the slip along them.
     Eigen::Matrix<double, Eigen::Dynamic, 2, 0, 18, 2> rows;
-    Eigen::Matrix<double, 2, Eigen::Dynamic, 0, 2, 18> slip_of_place, slip_of_motion;
+    SlipChanges slip_of_place, slip_of_motion, slip;
     Eigen::Matrix2d symmetric;  ///< slipping: the part along the rows that the symmetric matrix of a solver can hold
     double stiffness = 0.0;     ///< of the contact itself [kg]
     SmallVector force;          ///< slipping: on the coordinates y; in proportion to μ and to the contact's stiffness
@@ -30,7 +34,9 @@ struct FrictionTerm {
     }
 };
 
+/// `contact`: index into Zone::contacts.
 FrictionTerm friction_term(
-    const Zone& zone, const ZonePoint& point, const ActiveContact& active, const ContactFriction& friction);
+    const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
+    const ContactFriction& friction);
 
 }  // namespace diffsim
