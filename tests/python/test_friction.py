@@ -11,6 +11,7 @@ from small_scenes import assert_same
 from torch import Tensor
 
 import diffsim as ds
+from diffsim import scenes
 
 G = 9.8  # [m/s²]
 DT = 0.01
@@ -295,6 +296,22 @@ def test_a_stack_stands(count: int, offset: float, top: float) -> None:
     path = (sim := stack(count, offset, top)).rollout(sim.initial_state(), steps=200)
     assert path.velocity[-1].abs().max() < 1e-9
     assert (path.position[-1] - path.position[50])[:, :2].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("stones", [10, 25])
+def test_an_arch_stands_and_falls_with_less_friction(stones: int) -> None:
+    gap = 1e-4
+    scene = scenes.arch(stones, friction=0.7, radius=1.0, gap=gap)
+    sim = ds.Simulator(scene, DT, thickness=gap, on_failure="raise")
+    start = sim.initial_state()
+    path = sim.rollout(start, steps=100)
+    assert sim.info.sticking == sim.info.contacts and sim.info.zones == 1
+    assert (path.position - start.position).abs().max() < 1e-5  # a hundred-thousandth of its radius: it settles
+    assert (path.position[5:] - path.position[5]).abs().max() < 1e-9
+    assert path.velocity[-1].abs().max() < 1e-12
+    slippery = torch.full_like(sim.friction, 0.1)
+    loose = sim.rollout(start, steps=20, parameters={"friction": slippery})
+    assert (loose.position[-1] - start.position).abs().max() > 0.01
 
 
 def thrown(mu: float, **options: Any) -> ds.Simulator:
