@@ -8,12 +8,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from _limit_friction import ball_on_a_slope, box_between_walls, box_on_a_slope, card_house, heap, rod_on_its_tip
 
 import diffsim as ds
+from diffsim import scenes
 
 # Reasons for which a case may be red today.
 IMPACTS = "no impact stage: a step that is long for a fast or squeezed body has too much to solve"
 TURNS = "first-order rotation: a body that turns by a radian in a step is hit along a chord of its arc"
+THIN = "thin cards slide on their edges: normals turn by much over a slip"
 HORIZON = 0.5  # of most cases [s]
 
 
@@ -39,6 +42,8 @@ class Case:
 
 _CONVERGES = "every step converges"
 _SPEAKS = "converges, or says which step did not; never penetrates"
+_STANDS = "every step converges, and it stands"
+_ARCH_GAP = 1e-4  # between stones, and their thickness [m]
 
 
 def _decades(first: int, last: int, step: int = 1) -> list[float]:
@@ -48,13 +53,13 @@ def _decades(first: int, last: int, step: int = 1) -> list[float]:
 # ---- masses, stiffness, compliance, dt -------------------------------------------------------------------------------
 
 
-def _heavy_on_light(ratio: float) -> ds.Scene:
+def _heavy_on_light(ratio: float, friction: float = 0.0) -> ds.Scene:
     scene = ds.Scene()
-    scene.add_ground()
+    scene.add_ground(friction=friction)
     for k, mass in enumerate((1.0, ratio)):
         turned = (math.cos(0.1 * k), 0.0, 0.0, math.sin(0.1 * k))
         position = (0.02 * k, 0.0, 0.11 + 0.22 * k)
-        scene.add_body(ds.shapes.box(0.2), mass=mass, position=position, orientation=turned)
+        scene.add_body(ds.shapes.box(0.2), mass=mass, position=position, orientation=turned, friction=friction)
     return scene
 
 
@@ -159,15 +164,15 @@ def _on(lower: Sequence[float], upper: Sequence[float], height: float, kind: str
     return scene
 
 
-def _wedge_in_crack() -> ds.Scene:
+def _wedge_in_crack(friction: float = 0.0) -> ds.Scene:
     scene = ds.Scene()
     for sign in (-1.0, 1.0):
         turned = (math.cos(0.1 * sign), 0.0, math.sin(0.1 * sign), 0.0)
-        scene.add_body(
-            ds.shapes.box((0.2, 0.6, 0.6)), kind="static", position=(0.2 * sign, 0.0, 0.0), orientation=turned
-        )
+        side = ds.shapes.box((0.2, 0.6, 0.6))
+        scene.add_body(side, kind="static", position=(0.2 * sign, 0.0, 0.0), orientation=turned, friction=friction)
     wedge = ds.shapes.prism([[-0.15, 0.25], [0.0, -0.25], [0.15, 0.25]], 0.3)
-    scene.add_body(wedge, density=500.0, position=(0.001, 0.0, 0.6), orientation=(_HALF, _HALF, 0.0, 0.0))
+    upright = (_HALF, _HALF, 0.0, 0.0)
+    scene.add_body(wedge, density=500.0, position=(0.001, 0.0, 0.6), orientation=upright, friction=friction)
     return scene
 
 
@@ -329,6 +334,74 @@ def _cases() -> list[Case]:
     ]
     result.append(Case("many triangles", "bowl of 1e5", _bowl, _CONVERGES))
     result += [Case("chain of tori", f"{n} links", lambda n=n: _chain(n), _CONVERGES, steps=10) for n in (5, 30)]
+    return result + _friction_cases()
+
+
+def _friction_cases() -> list[Case]:
+    coefficients = (0.0, 1e-6, 0.1, 1.0, 10.0)
+    shapes = {"box on a slope": box_on_a_slope, "ball on a slope": ball_on_a_slope, "heap": heap}
+    result = [
+        Case(
+            "friction",
+            f"{mu:g}: {name}",
+            lambda b=build, mu=mu: b(mu),
+            _SPEAKS if name == "heap" else _CONVERGES,
+            steps=100 if name == "heap" else 50,
+        )
+        for name, build in shapes.items()
+        for mu in coefficients
+    ]
+    result += [
+        Case(
+            "mass ratio with friction 0.5",
+            f"{m:g}",
+            lambda m=m: _heavy_on_light(m, 0.5),
+            _CONVERGES if m <= 100 else _SPEAKS,
+        )
+        for m in _decades(0, 6)
+    ]
+    result += [
+        Case(
+            "card house",
+            f"{levels} high (friction 0.5)",
+            lambda n=levels: card_house(n, 0.5),
+            _STANDS,
+            still=1e-4,
+        )
+        for levels in (1, 2, 3)
+    ]
+    result.append(
+        Case("card house", "1 high (friction 0.1)", lambda: card_house(1, 0.1), "slides apart; " + _SPEAKS, reason=THIN)
+    )
+    result += [
+        Case(
+            "arch (friction 0.7)",
+            f"{stones} stones {'between abutments' if abutments else 'on the ground'}",
+            lambda n=stones, a=abutments: scenes.arch(n, friction=0.7, gap=_ARCH_GAP, abutments=a),
+            _STANDS,
+            steps=300,
+            still=1e-4,
+            options={"thickness": _ARCH_GAP},
+        )
+        for stones in (10, 25)
+        for abutments in (False, True)
+    ]
+    result += [
+        Case(
+            "jam",
+            "box between walls (friction 1.5)",
+            lambda: box_between_walls(1.5),
+            _STANDS,
+            still=1e-4,
+            energy=1.0,  # the wall does work
+        ),
+        Case("jam", "wedge in crack (friction 1.5)", lambda: _wedge_in_crack(1.5), _SPEAKS, quick=True),
+    ]
+    result += [
+        Case("jam", f"rod on its tip at {v:g} m/s (friction {mu:g})", lambda v=v, mu=mu: rod_on_its_tip(mu, v), _SPEAKS)
+        for mu in (1.5, 10.0)
+        for v in (-1.0, 1.0)
+    ]
     return result
 
 

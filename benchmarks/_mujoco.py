@@ -120,6 +120,13 @@ def ways_to_step(model: Any, data: Any, steps: int) -> dict[str, Callable[[], ob
     return {"mj_step": by_mj_step, "rollout": by_rollout}
 
 
+def set_friction(model: Any, friction: float, cone: str = "elliptic") -> None:
+    """Coulomb's, with one coefficient for all, in place of what the model was made with: none about the normal."""
+    model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if cone == "elliptic" else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    model.geom_condim[:] = 3
+    model.geom_friction[:] = (friction, 0.0, 0.0)
+
+
 def faster(seconds: Mapping[str, list[float]], prefix: str) -> list[float]:
     """The times of the faster of the cases whose names begin so."""
     return min((values for name, values in seconds.items() if name.startswith(prefix)), key=statistics.median)

@@ -1,21 +1,25 @@
 """Scenes in which much touches, beside MuJoCo's forward: stacks that collapse, bins, heaps, scans, thin things.
 
-Frictionless, steps of 0.01 s, one thread, times on the processor. One CSV line per scene: `forward_ms` is a step's mean
-over `Simulator.rollout` without gradients, whose loop is C++; `longest_ms` is the longest of the same steps taken by
-single calls, with failed steps, contacts (most of a step) and Newton iterations of the zone that took most, mean and
-most over the steps. The backward is of a loss on the last state, with respect to the initial state and the masses,
-over the same steps. MuJoCo takes the same steps in turns with ours, without friction (condim 1) and else with default
-options, looped over in C by the faster of `mj_step(nstep=...)` and `mujoco.rollout`; not where meshes are not convex,
-where there is cloth, nor of bodies it takes to be massless. `batch` is one call for 64 scenes of 10 boxes that touch
-two by two, pushed at random in every step by up to a fifth of their weight: its times are of a step of one of them.
-`longest_to_resting` is how much longer the dearest step of a landing takes than one at rest.
+Steps of 0.01 s, one thread, times on the processor. Without friction, but for scenes whose names say so: there its
+coefficient is 0.5, as in MuJoCo, whose cones are elliptic. One CSV line per scene: `forward_ms` is a step's mean over
+`Simulator.rollout` without gradients, whose loop is C++; `longest_ms` is the longest of the same steps taken by single
+calls, with failed steps, contacts (most of a step) and Newton iterations of the zone that took most, mean and most over
+the steps. The backward is of a loss on the last state, with respect to the initial state and the masses, over the same
+steps. MuJoCo takes the same steps in turns with ours, with default options else, looped over in C by the faster of
+`mj_step(nstep=...)` and `mujoco.rollout`; not where meshes are not convex, where there is cloth, nor of bodies it takes
+to be massless. `batch` is one call for 64 scenes of 10 boxes that touch two by two, pushed at random in every step by
+up to a fifth of their weight: its times are of a step of one of them. `longest_to_resting` is how much longer the
+dearest step of a landing takes than one at rest. Scenes called `_rest` begin where they have come to rest, ours and
+MuJoCo's each in its own way: how fast they still are is in the line before.
 
     python benchmarks/contact_rich.py --scene bin_20 stack_100 --steps 40
 
 Should be at most, as forward / MuJoCo: 8 for stacks, 12 and 20 for bins, 35, 35 and 12 for layers, with a log-log slope
 of 1.35 from 80 to 500 boxes; 8 s in all for the heaps; 400 ms for the longest step of 20,000 faces, 40 ms on average
 and 4 times that at 100,000; 1 s in all for the wire and 50 ms for a step of the specks; 1 / 1.5 for the batch; 8 for
-`longest_to_resting`; 0.3 for the backward of stacks, bins, layers and heaps; no failed step. Needs the extra `bench`.
+`longest_to_resting`; 0.3 for the backward of stacks, bins, layers and heaps; no failed step. With friction: 6 for the
+bin, 3 for it at rest; 1.5 for the two layers at rest, and their backward 0.6 of MuJoCo's forward. Needs the extra
+`bench`.
 """
 
 from __future__ import annotations
@@ -46,16 +50,17 @@ from _common import (
     slope,
 )
 from _contact_scenes import scan_on_scan, specks, wire_under_sheet
-from _mujoco import faster, frictionless, ways_to_step
+from _mujoco import faster, frictionless, set_friction, ways_to_step
 
 import diffsim as ds
 from diffsim import scenes
 
 DT = 0.01
 SETTLE = 200  # steps until what lands is at rest
+FRICTION = 0.5
 COLUMNS = ("scene", "bodies", "steps", "forward_s", "forward_ms", "longest_ms", "failed_steps", "contacts")
 COLUMNS += ("iterations_mean", "iterations_most", "backward_to_forward", "mujoco_ms", "forward_to_mujoco")
-COLUMNS += ("longest_to_resting",)
+COLUMNS += ("backward_to_mujoco", "longest_to_resting")
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,8 @@ class Case:
     steps: int
     in_mujoco: bool = True
     lands: bool = False  # whether to compare with steps at rest
+    friction: float = 0.0
+    settle: int = 0  # steps before the first that counts
 
 
 def heaps(count: int) -> list[ds.Scene]:
@@ -76,6 +83,11 @@ def heaps(count: int) -> list[ds.Scene]:
 
 def one(make: Callable[[Any], ds.Scene]) -> Callable[[Any], list[ds.Scene]]:
     return lambda size: [make(size)]
+
+
+def two_layers(count: int) -> ds.Scene:
+    """Of `count` cubes, or one fewer: the upper layer has one less than the lower."""
+    return scenes.two_layer_stack((count + 1) // 2)
 
 
 CASES = {
@@ -91,8 +103,14 @@ CASES = {
     "scan_100000": Case(one(scan_on_scan), (100_000, 180), 80, in_mujoco=False),
     "wire": Case(one(wire_under_sheet), (21, 4), 12, in_mujoco=False),
     "specks": Case(one(specks), (1e-6, 1e-2), 80, in_mujoco=False),
-    "landing_100": Case(one(lambda count: scenes.two_layer_stack((count + 1) // 2)), (100, 5), 12, lands=True),
-    "landing_300": Case(one(lambda count: scenes.two_layer_stack((count + 1) // 2)), (300, 7), 12, lands=True),
+    "landing_100": Case(one(two_layers), (100, 5), 12, lands=True),
+    "landing_300": Case(one(two_layers), (300, 7), 12, lands=True),
+    "bin_20_friction": Case(one(scenes.boxes_in_bin), (20, 5), 300, friction=FRICTION),
+    "bin_20_friction_rest": Case(one(scenes.boxes_in_bin), (20, 5), 100, friction=FRICTION, settle=2 * SETTLE),
+    **{
+        f"two_layers_{count}_friction_rest": Case(one(two_layers), (count, 7), 10, friction=FRICTION, settle=SETTLE)
+        for count in (300, 1000, 3000)
+    },
 }
 BATCH, BATCH_BODIES, BATCH_STEPS = 64, 10, 100
 
@@ -100,14 +118,26 @@ BATCH, BATCH_BODIES, BATCH_STEPS = 64, 10, 100
 class Run:
     """One scene, ours and MuJoCo's."""
 
-    def __init__(self, scene: ds.Scene, steps: int, in_mujoco: bool) -> None:
+    def __init__(self, scene: ds.Scene, steps: int, case: Case) -> None:
         self.sim = ds.Simulator(scene, dt=DT, num_threads=1)
+        with torch.no_grad():
+            self.sim.friction.fill_(case.friction)
         self.start = self.sim.initial_state()
         self.steps = steps
-        self.forward = partial(advance, self.sim, self.start, steps)
         self.mujoco: dict[str, Callable[[], object]] = {}
-        if in_mujoco:
-            self.mujoco = ways_to_step(*frictionless(scene, self.start, dt=DT), steps)
+        if case.in_mujoco:
+            model, data = frictionless(scene, self.start, dt=DT)
+            if case.friction > 0.0:
+                set_friction(model, case.friction)
+            if case.settle:
+                mujoco.mj_step(model, data, nstep=case.settle)
+            self.mujoco = ways_to_step(model, data, steps)
+        if case.settle:
+            self.start = advance(self.sim, self.start, case.settle)[-1]
+            speeds = f"{float(self.start.velocity.abs().max()):.1g}"
+            speeds += f", MuJoCo's {np.abs(data.qvel.reshape(-1, 6)[:, :3]).max():.1g}" if case.in_mujoco else ""
+            print(f"# at rest to {speeds} m/s")
+        self.forward = partial(advance, self.sim, self.start, steps)
 
     def step_by_step(self, clock: Callable[[], float]) -> list[tuple[float, ds.Info]]:
         """Seconds and statistics of every step."""
@@ -143,7 +173,7 @@ def measure(name: str, case: Case, options: argparse.Namespace) -> dict[str, Any
     """A line of the table."""
     made = options.make(name, case)
     steps = min(case.steps, options.steps or case.steps)
-    runs = [Run(scene, steps, case.in_mujoco) for scene in made]
+    runs = [Run(scene, steps, case) for scene in made]
     clock = options.clock
     singles = [one_step for run in runs for one_step in run.step_by_step(clock)]
     seconds = [spent for spent, _ in singles]
@@ -152,6 +182,9 @@ def measure(name: str, case: Case, options: argparse.Namespace) -> dict[str, Any
     for way in runs[0].mujoco:
         cases[f"mujoco {way}"] = partial(all_of, [run.mujoco[way] for run in runs])
         cases[f"mujoco {way}"]()  # once before it is timed, as ours was
+    if case.settle and not options.forward_only:
+        cases["backward"] = Recorded(runs[0].sim, runs[0].start, steps).backward
+        cases["backward"]()
     times = in_turns(cases, options.rounds, clock)
     forward = statistics.median(times["forward"])
     row: dict[str, Any] = {
@@ -166,12 +199,16 @@ def measure(name: str, case: Case, options: argparse.Namespace) -> dict[str, Any
         "iterations_mean": statistics.mean(info.iterations for info in infos),
         "iterations_most": max(info.iterations for info in infos),
     }
-    if not options.forward_only:
+    if "backward" in times:
+        row["backward_to_forward"] = median_ratio(times["backward"], times["forward"])
+    elif not options.forward_only:
         row["backward_to_forward"] = sum(run.backward(clock) for run in runs) / forward
     if case.in_mujoco:
         best = faster(times, "mujoco ")
         row["mujoco_ms"] = 1e3 * statistics.median(best) / len(singles)
         row["forward_to_mujoco"] = median_ratio(times["forward"], best)
+        if "backward" in times:
+            row["backward_to_mujoco"] = median_ratio(times["backward"], best)
     if case.lands:
         resting = in_turns({"rest": runs[0].at_rest()}, options.rounds, clock)["rest"]
         row["longest_to_resting"] = max(seconds) / (statistics.median(resting) / 10)

@@ -7,8 +7,9 @@ initial state and the masses). Prints one CSV line per N, medians over rounds, a
 1.0 (forward / MuJoCo), 2.0 (forward + backward / MuJoCo), 1.05 (slopes), 2000 bytes of tape per cube and step.
 
 Also: the peak of memory added by building and forward + backward, and by building and forward in MuJoCo; the gap that
-cubes at rest keep from the plane. MuJoCo's cubes have friction and soft contacts; ours are frictionless for now, and
-stiff. Needs the extra `bench`.
+cubes at rest keep from the plane. MuJoCo's cubes have friction and soft contacts; ours are stiff, and frictionless
+unless --friction gives all of them, and MuJoCo's, a coefficient: they take turns with frictionless ones then, and
+should take at most 1.5 times as long forward. Needs the extra `bench`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from _common import (
     print_slopes,
     tape_bytes,
 )
-from _mujoco import CONES, boxes, faster, ways_to_step
+from _mujoco import CONES, boxes, faster, set_friction, ways_to_step
 
 import diffsim as ds
 from diffsim import scenes
@@ -46,8 +47,9 @@ DT, STEPS = 0.01, 200
 DROP, STRIDE, DENSITY = 0.5, 2.0, 1000.0
 TIMES = ("forward_s", "forward_backward_s", "mujoco_pyramidal_s", "mujoco_elliptic_s")
 RATIOS = tuple(f"{ours}_to_{cone}" for ours in ("forward", "forward_backward") for cone in CONES)
+TO_FRICTIONLESS = ("forward_to_frictionless", "forward_backward_to_frictionless")  # with --friction
 COLUMNS = ("cubes", "steps", *TIMES, *RATIOS)
-COLUMNS += ("tape_bytes_per_cube_step", "memory_mb", "mujoco_memory_mb", "rest_gap_m")
+FACTS = ("tape_bytes_per_cube_step", "memory_mb", "mujoco_memory_mb", "rest_gap_m")
 
 
 class Worker:
@@ -56,14 +58,20 @@ class Worker:
     cases: ClassVar[dict[str, Callable[[], object]]] = {}
 
     @classmethod
-    def prepare(cls, count: int) -> dict[str, float]:
+    def prepare(cls, count: int, friction: float) -> dict[str, float]:
         """Build all scenes and run each once. Returns the columns that are not times."""
         torch.set_num_threads(1)
         made: dict[str, Any] = {}
 
-        def make_and_differentiate() -> None:
+        def make(friction: float) -> ds.Simulator:
             scene = scenes.falling_cubes(count, drop=DROP, stride=STRIDE, density=DENSITY)
-            made["sim"] = ds.Simulator(scene, dt=DT, num_threads=1, on_failure="raise")
+            sim = ds.Simulator(scene, dt=DT, num_threads=1, on_failure="raise")
+            with torch.no_grad():
+                sim.friction.fill_(friction)
+            return sim
+
+        def make_and_differentiate() -> None:
+            made["sim"] = make(friction)
             made["start"] = made["sim"].initial_state()
             differentiate(made["sim"], made["start"], STEPS)
 
@@ -72,6 +80,8 @@ class Worker:
 
         def mujoco_runs(cone: str) -> dict[str, Callable[[], object]]:
             model, data = boxes(start.position.numpy(), 1.0, dt=DT, density=DENSITY, cone=cone)
+            if friction > 0.0:
+                set_friction(model, friction, cone)
             return ways_to_step(model, data, STEPS)
 
         facts["mujoco_memory_mb"] = added_memory(lambda: mujoco_runs(CONES[0])["mj_step"]())
@@ -81,6 +91,10 @@ class Worker:
             "forward": partial(advance, sim, start, STEPS),
             "forward_backward": partial(differentiate, sim, start, STEPS),
         }
+        if friction > 0.0:
+            without = make(0.0)
+            cls.cases["frictionless_forward"] = partial(advance, without, start, STEPS)
+            cls.cases["frictionless_forward_backward"] = partial(differentiate, without, start, STEPS)
         for cone in CONES:
             for name, run in mujoco_runs(cone).items():
                 cls.cases[f"mujoco_{cone} {name}"] = run
@@ -102,22 +116,27 @@ def row_of(count: int, facts: dict[str, float], rounds: list[dict[str, float]]) 
     row.update({f"{name}_s": statistics.median(values) for name, values in seconds.items()})
     for ours in ("forward", "forward_backward"):
         row.update({f"{ours}_to_{cone}": median_ratio(seconds[ours], seconds[f"mujoco_{cone}"]) for cone in CONES})
+        if without := seconds.get(f"frictionless_{ours}"):
+            row[f"{ours}_to_frictionless"] = median_ratio(seconds[ours], without)
     return row
 
 
 def main() -> int:
     parser = make_parser(__doc__, rounds=11)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="numbers of cubes")
+    parser.add_argument("--friction", type=float, default=0.0, help="coefficient of all cubes and the plane")
     options = parser.parse_args()
     if options.quick:
         options.counts, options.rounds = [4], 1
     print_header("mujoco", clock=options.clock)
-    table = Table(COLUMNS)
+    table = Table((*COLUMNS, *(TO_FRICTIONLESS if options.friction > 0.0 else ()), *FACTS))
     rounds: dict[int, list[dict[str, float]]] = {count: [] for count in options.counts}
     with ExitStack() as stack:
         processes = fresh_processes()
         workers = {count: stack.enter_context(ProcessPoolExecutor(1, processes)) for count in options.counts}
-        facts = {count: worker.submit(Worker.prepare, count).result() for count, worker in workers.items()}
+        facts = {
+            count: worker.submit(Worker.prepare, count, options.friction).result() for count, worker in workers.items()
+        }
         for _ in range(options.rounds):  # the numbers of cubes take turns, too, for the sake of the slopes
             for count, worker in workers.items():
                 rounds[count].append(worker.submit(Worker.measure, options.clock).result())

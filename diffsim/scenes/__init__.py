@@ -11,9 +11,11 @@ from .contact import (
     two_spheres,
 )
 from .heaps import boxes_in_bin, collapsing_stack, heap_of_boxes_and_balls, touching_boxes, tumbling_layers
+from .masonry import arch
 from .piles import falling_cubes, row_of_cubes, two_layer_stack
 
 __all__ = [
+    "arch",
     "box_on_box",
     "boxes_in_bin",
     "collapsing_stack",

@@ -12,6 +12,7 @@ from small_scenes import assert_same
 from torch import Tensor
 
 import diffsim as ds
+from diffsim import scenes
 
 G = 9.8  # [m/s²]
 DT = 0.01
@@ -296,6 +297,37 @@ def test_a_stack_stands(count: int, offset: float, top: float) -> None:
     path = (sim := stack(count, offset, top)).rollout(sim.initial_state(), steps=200)
     assert path.velocity[-1].abs().max() < 1e-9
     assert (path.position[-1] - path.position[50])[:, :2].abs().max() < 1e-6
+
+
+GAP = 1e-4  # of stones, and what they keep apart
+
+
+def arch(stones: int, **shape: Any) -> ds.Simulator:
+    return ds.Simulator(scenes.arch(stones, friction=0.7, gap=GAP, **shape), DT, thickness=GAP, on_failure="raise")
+
+
+@pytest.mark.parametrize("stones", [10, 25])
+def test_an_arch_stands_and_falls_with_less_friction(stones: int) -> None:
+    sim = arch(stones)
+    start = sim.initial_state()
+    path = sim.rollout(start, steps=100)
+    assert sim.info.sticking == sim.info.contacts and sim.info.zones == 1
+    assert (path.position - start.position).abs().max() < 1e-5  # a hundred-thousandth of its radius: it settles
+    assert (path.position[5:] - path.position[5]).abs().max() < 1e-9
+    assert path.velocity[-1].abs().max() < 1e-12
+    slippery = torch.full_like(sim.friction, 0.1)
+    loose = sim.rollout(start, steps=20, parameters={"friction": slippery})
+    assert (loose.position[-1] - start.position).abs().max() > 0.01
+
+
+@pytest.mark.parametrize(("share", "stands"), [(1.01, True), (0.98, False)])
+def test_an_arch_falls_where_the_line_of_thrust_leaves_it(share: float, stands: bool) -> None:
+    """A semicircular one does where it is thinner than 0.1075 of its mean radius, as Milankovitch found."""
+    thinnest = 0.1075 / (1.0 - 0.5 * 0.1075)  # of an inner radius of 1
+    sim = arch(10, radius=1.0, ring=share * thinnest)
+    start = sim.initial_state()
+    moved = (end_of(sim, 40).position - start.position).abs().max()
+    assert moved < 1e-5 if stands else moved > 5e-3
 
 
 def thrown(mu: float, **options: Any) -> ds.Simulator:

@@ -22,6 +22,10 @@ GREEN = {
     ("coplanar faces: gap [m]", "1e-08"),
     ("meeting", "corner on corner"),
     ("turned about an axis", "180° about 1 1 1"),
+    ("friction", "10: heap"),
+    ("card house", "2 high (friction 0.5)"),
+    ("jam", "box between walls (friction 1.5)"),
+    ("jam", "rod on its tip at -1 m/s (friction 10)"),
 }
 CHOSEN = [case for case in CASES if (case.family, case.value) in GREEN]
 
