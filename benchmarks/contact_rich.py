@@ -46,7 +46,7 @@ from _common import (
     slope,
 )
 from _contact_scenes import scan_on_scan, specks, wire_under_sheet
-from _mujoco import faster, frictionless, ways_to_step
+from _mujoco import faster, model_of, ways_to_step
 
 import diffsim as ds
 from diffsim import scenes
@@ -107,7 +107,7 @@ class Run:
         self.forward = partial(advance, self.sim, self.start, steps)
         self.mujoco: dict[str, Callable[[], object]] = {}
         if in_mujoco:
-            self.mujoco = ways_to_step(*frictionless(scene, self.start, dt=DT), steps)
+            self.mujoco = ways_to_step(*model_of(scene, self.start, dt=DT), steps)
 
     def step_by_step(self, clock: Callable[[], float]) -> list[tuple[float, ds.Info]]:
         """Seconds and statistics of every step."""
@@ -193,7 +193,7 @@ def measure_batch(options: argparse.Namespace) -> dict[str, Any]:
         with torch.no_grad():
             sim.rollout(start, controls, steps)
 
-    model, data = frictionless(scene, sim.initial_state(), dt=DT)
+    model, data = model_of(scene, sim.initial_state(), dt=DT)
     initial = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, initial, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     pushed = np.zeros((count, steps, model.nbody, 6))  # body 0 is the world

@@ -1,15 +1,17 @@
 """Error against run time: motions, gradients, and the useful gradient, beside MuJoCo in the same run.
 
-Each scene of `_report_scenes.py` and `_report_gradients.py` is run by all its methods with all its steps; errors are
-from a closed form where there is one, else from the limit dt -> 0. Times are those of the steps alone, on the
+Each scene is run by all its methods with all its steps; errors are from a closed form where there is one, else from the
+limit dt -> 0. Times are those of the steps alone, on the
 processor, one thread, medians. Writes a page in Markdown and in HTML, its plots and its CSV into --out; prints the CSV.
 
-To add a scene, a method or a peer, add one entry to the tables there.
+To add a scene, a method or a peer, add one entry to a table: `FREE`, `IMPACTS`, `FRICTION` and `CLOTH` of motions,
+`CONTACT_GRADIENTS` and `FRICTION_GRADIENTS` of gradients, each at the end of the file of its name.
 """
 
 from __future__ import annotations
 
 import csv
+import itertools
 import sys
 import time
 import warnings
@@ -19,13 +21,29 @@ from typing import Any
 import mujoco
 import torch
 from _common import Table, make_parser, print_header
-from _report_gradients import GRADIENTS, SHARP, GradientScene, Inputs, continuous, mujoco_differences, relative
-from _report_motion import Unstable, timed
+from _report_cloth import CLOTH
+from _report_free import FREE
+from _report_friction import FRICTION
+from _report_friction_gradients import FRICTION_GRADIENTS
+from _report_gradients import (
+    CONTACT_GRADIENTS,
+    DIFFERENCES,
+    SHARP,
+    WIDE,
+    GradientScene,
+    Inputs,
+    continuous,
+    mujoco_differences,
+    relative,
+)
+from _report_impacts import IMPACTS
+from _report_motion import Unstable, ValueScene, timed
 from _report_page import Panel, Section, machine, verdict, write
 from _report_peers import GRADIENTS as PEER_GRADIENTS
 from _report_peers import TIMES as PEER_TIMES
-from _report_scenes import SCENES, ValueScene
 
+SCENES = (*FREE, *IMPACTS, *FRICTION, *CLOTH)
+GRADIENTS = (*CONTACT_GRADIENTS, *FRICTION_GRADIENTS)
 COLUMNS = ("scene", "what", "name", "dt_s", "time_ms", "error")
 TIME = "time on the processor [ms]"
 PACKAGES = ("mesh-diffsim", "torch", "numpy", "scipy", "mujoco")
@@ -85,12 +103,16 @@ def measure_gradients(case: GradientScene, table: Table, steps: tuple[float, ...
         table.add({**row, "what": CONTINUOUS, "error": relative(gradient, right)})
 
     for dt in steps:
-        discrete = Inputs(case, dt, tolerance=SHARP).discrete()
-        for adjoint in ("exact", "qr", "dense"):
-            add(f"diffsim {adjoint}", dt, *timed(Inputs(case, dt, adjoint=adjoint).adjoint, quick), discrete)
-        add("diffsim differences", dt, *timed(Inputs(case, dt).differences, quick), discrete)
-        for integrator in case.mujoco:
-            add(f"MuJoCo {integrator} differences", dt, *timed(mujoco_differences(case, dt, integrator), quick))
+        discrete: dict[str, Any] = {}  # by integrator
+        for name, options in case.ours:
+            integrator = options.get("integrator", "implicit_euler")
+            if integrator not in discrete:
+                discrete[integrator] = Inputs(case, dt, tolerance=SHARP, integrator=integrator).discrete()
+            add(f"diffsim {name}", dt, *timed(Inputs(case, dt, **options).adjoint, quick), discrete[integrator])
+        add("diffsim differences", dt, *timed(Inputs(case, dt).differences, quick), discrete["implicit_euler"])
+        for settings, eps in itertools.product(case.mujoco, (DIFFERENCES, WIDE)):
+            differences = mujoco_differences(case, dt, settings, eps)
+            add(f"{settings.name} differences of {eps:g}", dt, *timed(differences, quick))
 
 
 def section_of_gradients(case: GradientScene, table: Table, steps: tuple[float, ...]) -> Section:
@@ -119,17 +141,21 @@ def section_of_gradients(case: GradientScene, table: Table, steps: tuple[float, 
 
 INTRODUCTION = (
     "A reader looks at the plots: left is faster, below is more exact. In each, the same scene is run with ever smaller"
-    " steps. MuJoCo runs without friction and with its default contacts, unless a name says otherwise. Ours keeps"
-    " surfaces apart by the scene's thickness, which closed forms take into account; errors of exactly 0 are drawn at"
-    " the bottom.",
+    " steps. MuJoCo runs with the scene's friction, without where there is none, and with its default contacts and"
+    " pyramidal cones, unless a name says otherwise. Ours keeps surfaces apart by the scene's thickness, which closed"
+    " forms take into account; errors of exactly 0 are drawn at the bottom.",
     "*Smooth motion*: our default steps are implicit Euler, of first order; `trapezoidal` is of second order there,"
     " keeps what free motion keeps, and pays for contact with a second solve. MuJoCo's RK4 is of fourth order.",
+    "*Friction*: a stack that leans, a box that has stopped and a ball that rolls should not creep or slip at all."
+    " MuJoCo's friction gives way with a speed that impratio divides; ours is exact, and slips by rounding.",
 )
 GRADIENT_INTRODUCTION = (
-    "`exact` keeps the curvature of contacts, `qr` and `dense` leave it out as the paper does. Differences are central."
-    " A gradient can be that of the steps that were run, and still not be useful: an impact falls into some step,"
-    " and where in the step it falls changes with the inputs. The third plot of a scene shows whether that fades as dt"
-    " falls; where it does not, a gradient averaged over many starts is right and a single one is not."
+    "`exact` keeps the curvature of contacts, `qr` and `dense` leave it out as the paper does and have no friction;"
+    " `trapezoidal` is `exact` with the other integrator. Differences are central; MuJoCo's are taken with two"
+    " widths, of which the larger averages over what jumps from step to step. A gradient can be that of the steps"
+    " that were run, and still not be useful: an impact falls into some step, and where in the step it falls changes"
+    " with the inputs. The third plot of a scene shows whether that fades as dt falls; where it does not, a gradient"
+    " averaged over many starts is right and a single one is not."
 )
 
 
