@@ -18,7 +18,7 @@ import diffsim as ds
 
 G = 9.81
 ROUNDS = 3
-SHORT = 0.05  # a run that takes less is timed more often [s]
+SHORT, LONG = 0.05, 1.0  # a run that takes less is timed more often, and one that takes more once [s]
 
 
 class Unstable(RuntimeError):
@@ -172,22 +172,15 @@ def timed(run: Callable[[], Any], quick: bool = False) -> tuple[Any, float]:
 
     `quick`: that one is.
     """
-    start = time.process_time()
-    result = run()
-    if quick:
-        return result, 1e3 * (time.process_time() - start)
-    rounds = ROUNDS if time.process_time() - start > SHORT else 3 * ROUNDS
-    seconds = []
-    for _ in range(rounds):
+    seconds: list[float] = []
+    rounds = 1 if quick else 2
+    while len(seconds) < rounds:
         start = time.process_time()
         result = run()
         seconds.append(time.process_time() - start)
-    return result, 1e3 * statistics.median(seconds)
-
-
-def extrapolated(coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """The limit of errors that halve with dt."""
-    return 2.0 * fine - coarse
+        if len(seconds) == 1 and not quick:
+            rounds += 0 if seconds[0] > LONG else ROUNDS - 1 if seconds[0] > SHORT else 3 * ROUNDS - 1
+    return result, 1e3 * statistics.median(seconds if quick else seconds[1:])
 
 
 def rms(difference: np.ndarray) -> float:
