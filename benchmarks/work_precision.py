@@ -73,6 +73,7 @@ class Report(Table):
                 self.rows += [_read(row) for row in csv.DictReader(file) if row["scene"] not in but]
 
     def write(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, self.columns)
             writer.writeheader()
@@ -210,7 +211,7 @@ def main() -> int:
     parser = make_parser(__doc__, plot=True)
     parser.set_defaults(clock=time.process_time, out=Path("out/report"))
     names = [case.name for case in (*SCENES, *GRADIENTS)]
-    parser.add_argument("--scene", nargs="+", choices=names, default=names, help="which to run")
+    parser.add_argument("--scene", nargs="*", choices=names, default=names, help="which to run; none: draw")
     parser.add_argument("--reduced", action="store_true", help="for busy machines: three steps of a sweep, short stack")
     options = parser.parse_args()
     warnings.simplefilter("ignore")  # steps that fail are named on the page
@@ -219,6 +220,8 @@ def main() -> int:
     print_header("scipy", "mujoco", clock=options.clock)
     load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
     report = Report(f"{datetime.date.today().isoformat()} at load {load}")
+    file = options.out / "work_precision.csv"
+    report.keep(file, options.scene)
     for case in SCENES:
         if case.name not in options.scene or (options.quick and not case.quick):
             continue
@@ -227,12 +230,13 @@ def main() -> int:
         if options.quick or options.reduced:
             duration = min(duration, 0.2 if options.quick else 10.0)
         measure_values(case, report, steps, duration, options.quick)
+        report.write(file)
     for scene in GRADIENTS:
         if scene.name not in options.scene or (options.quick and not scene.quick):
             continue
         steps = tuple(scene.steps[:1] if options.quick else scene.steps[:3] if options.reduced else scene.steps)
         measure_gradients(scene, report, steps, options.quick)
-    report.keep(options.out / "work_precision.csv", options.scene)
+        report.write(file)
     note = "**A reduced run**: three steps of each sweep, scenes of 10 s at most." if options.reduced else ""
     if options.quick:
         note = "**A smoke run**: its numbers mean nothing."
@@ -244,7 +248,6 @@ def main() -> int:
         Section("peers", "Peers measured separately", [PEERS_TEXT], tables=[PEER_TIMES, PEER_GRADIENTS]),
     ]
     write(options.out, "Error against run time", [section for section in sections if section is not None])
-    report.write(options.out / "work_precision.csv")
     return 0
 
 

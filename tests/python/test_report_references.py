@@ -20,6 +20,7 @@ from _report_friction import FRICTION, PEERS, bowled, top_axis  # noqa: E402
 from _report_impacts import two_balls  # noqa: E402
 from _report_motion import TRAPEZOIDAL, ValueScene, mujoco_bodies  # noqa: E402
 from _report_page import Panel, verdict  # noqa: E402
+from work_precision import Report, section_of_values  # noqa: E402
 
 
 def scene_of(table: tuple[ValueScene, ...], name: str) -> ValueScene:
@@ -97,3 +98,22 @@ def test_a_peer_that_is_better_is_named_with_the_number() -> None:
         (([0.1], [1e-1]), "peer (never as exact)"),
     ):
         assert words in verdict(Panel("x", "y", {"ours": ours, "peer": peer}, frozenset({"ours"})))
+
+
+def test_a_report_keeps_what_an_earlier_run_said_of_other_scenes(tmp_path: Path) -> None:
+    brick, coin = (scene_of(FREE, name) for name in ("brick", "coin"))
+    earlier = Report("then")
+    for case in (brick, coin):
+        row = {"scene": case.name, "dt_s": 0.5}
+        for label in case.errors:
+            earlier.add({**row, "what": label, "name": "diffsim", "time_ms": 2.0, "error": 0.1})
+        earlier.add({**row, "what": label, "name": "MuJoCo RK4", "failure": "blew up"})
+    earlier.write(tmp_path / "out" / "report.csv")
+    report = Report("now")
+    report.keep(tmp_path / "out" / "report.csv", ["brick"])
+    assert section_of_values(brick, report) is None
+    section = section_of_values(coin, report)
+    assert section is not None
+    assert section.text[0].endswith("Run then; dt = 0.5 s.")
+    assert section.text[-1] == "No end at dt = 0.5 s: MuJoCo RK4 (blew up)."
+    assert [panel.curves for panel in section.panels] == [{"diffsim": ([2.0], [0.1])}] * 2
