@@ -259,7 +259,7 @@ FRICTION = (
         slide_to_rest,
         1.0,
         TENTHS,
-        {"way (rms over time) [m]": _stopping, "moves in the last 0.5 s, at rest [m]": _moves_at_rest},
+        {"way (rms over time) [m]": _stopping, "moves in the last half second [m]": _moves_at_rest},
         (*_OURS, *MUJOCO),
         quick=True,
     ),
@@ -302,6 +302,8 @@ FRICTION = (
         TENTHS,
         {"direction of the axis after 1 s [rad]": _top_error},
         (*_OURS, *MUJOCO, mujoco_bodies(Settings("RK4", cone="elliptic"))),
+        note="What touches turns by implicit Euler in either of our integrators, which takes from the spin: of first"
+        " order, with a large constant. This is a scene for MuJoCo.",
     ),
     ValueScene(
         "leaning_stack",

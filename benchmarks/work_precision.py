@@ -135,6 +135,7 @@ def section_of_values(case: ValueScene, report: Report) -> Section | None:
         if row["failure"]:
             failed.setdefault((row["name"], row["failure"]), []).append(f"{row['dt_s']:g}")
     text = [f"Errors from: {case.reference}. {run_of(rows)}", *map(verdict, panels)]
+    text += [case.note] if case.note else []
     text += [f"No end at dt = {', '.join(steps)} s: {name} ({why})." for (name, why), steps in failed.items()]
     return Section(f"value_{case.name}", case.title, text, panels)
 

@@ -20,7 +20,7 @@ from _report_friction import FRICTION, PEERS, bowled, top_axis  # noqa: E402
 from _report_impacts import two_balls  # noqa: E402
 from _report_motion import TRAPEZOIDAL, ValueScene, mujoco_bodies  # noqa: E402
 from _report_page import Panel, verdict  # noqa: E402
-from work_precision import Report, section_of_values  # noqa: E402
+from work_precision import SCENES, Report, section_of_values  # noqa: E402
 
 
 def scene_of(table: tuple[ValueScene, ...], name: str) -> ValueScene:
@@ -98,6 +98,13 @@ def test_a_peer_that_is_better_is_named_with_the_number() -> None:
         (([0.1], [1e-1]), "peer (never as exact)"),
     ):
         assert words in verdict(Panel("x", "y", {"ours": ours, "peer": peer}, frozenset({"ours"})))
+
+
+def test_scenes_have_names_of_their_own_and_labels_that_csv_can_hold() -> None:
+    assert len({case.name for case in SCENES}) == len(SCENES)
+    for case in SCENES:
+        assert case.errors
+        assert not [text for text in (*case.errors, *(method.name for method in case.methods)) if "," in text]
 
 
 def test_a_report_keeps_what_an_earlier_run_said_of_other_scenes(tmp_path: Path) -> None:
