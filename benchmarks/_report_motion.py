@@ -72,7 +72,7 @@ class ValueScene:
     methods: Sequence[Method]
     limit_dt: float | None = None  # of the run errors are from, without closed form [s]
     quick: bool = False  # part of quick runs
-    note: str = ""  # why a peer is better here
+    note: str = ""  # why a peer is better here, or seems to be
 
 
 def diffsim(name: str = "diffsim", **options: Any) -> Method:
