@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -44,22 +45,64 @@ def boxes(
     return model, data
 
 
-def frictionless(
+@dataclass(frozen=True)
+class Settings:
+    """What MuJoCo is run with: its defaults, but for what is said here."""
+
+    integrator: str = "Euler"
+    cone: str = "pyramidal"
+    impratio: float = 1.0  # by how much friction is stiffer than the normal direction, against creep
+    stiff: bool = False  # contacts as stiff as a step lets them be
+
+    @property
+    def name(self) -> str:
+        words = ["MuJoCo", self.integrator]
+        words += [self.cone] if self.cone != "pyramidal" else []
+        words += [f"impratio {self.impratio:g}"] if self.impratio != 1.0 else []
+        return " ".join(words + ["stiff"] * self.stiff)
+
+    def option(self, dt: float, gravity: ArrayLike) -> str:
+        """The element of a model."""
+        return (
+            f'<option timestep="{dt}" integrator="{self.integrator}" cone="{self.cone}" impratio="{self.impratio}"'
+            f' gravity="{_numbers(gravity)}"/>'
+        )
+
+
+DEFAULT = Settings()
+
+
+def model_of(
     scene: ds.Scene,
     state: ds.State,
     *,
     dt: float,
-    integrator: str = "Euler",
-    stiff: bool = False,
+    settings: Settings = DEFAULT,
     mass: ArrayLike | None = None,
+    friction: ArrayLike | None = None,
 ) -> tuple[Any, Any]:
-    """Model and data of the bodies of a scene at a state, without friction, else with default options.
+    """Model and data of the bodies of a scene at a state, with the scene's friction, and without where it has none.
 
     Meshes of 8 vertices are boxes, and must be upright in their body's frame; of others MuJoCo takes the convex hull.
-    `stiff`: contacts as stiff as a step lets them be, not the default ones. `mass`: in place of the scene's [kg].
+    `mass`, `friction`: in place of the scene's [kg], [1]. Of two objects MuJoCo takes the larger coefficient, not the
+    geometric mean: all must have the same.
     """
     p = scene.pack()
-    mass = p.mass if mass is None else np.asarray(mass)
+    assets, elements = body_elements(p, state, p.mass if mass is None else np.asarray(mass))
+    contact = contact_attributes(p.friction if friction is None else np.asarray(friction))
+    contact += f' solref="{2.0 * dt} 1" solimp="0.9999 0.9999 0.001"' if settings.stiff else ""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco>{settings.option(dt, p.gravity)}
+        <default><geom {contact}/></default>
+        <asset>{assets}</asset><worldbody>{elements}</worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    set_velocity(data.qvel, p, state)
+    return model, data
+
+
+def body_elements(p: Any, state: ds.State, mass: np.ndarray) -> tuple[str, str]:
+    """Assets, and what the world has of bodies and ground, of a packed scene at a state."""
     meshes, bodies = [], []
     last = np.cumsum(p.vertex_count)
     for body, (name, count) in enumerate(zip(p.names, p.vertex_count)):
@@ -79,15 +122,13 @@ def frictionless(
         else:
             bodies.append(f"<geom {shape} {place}/>")
     ground = f'<geom type="plane" size="0 0 1" pos="0 0 {p.ground_height}"/>' if p.has_ground else ""
-    contact = f'solref="{2.0 * dt} 1" solimp="0.9999 0.9999 0.001"' if stiff else ""
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="{dt}" integrator="{integrator}" gravity="{_numbers(p.gravity)}"/>
-        <default><geom condim="1" {contact}/></default>
-        <asset>{"".join(meshes)}</asset><worldbody>{ground}{"".join(bodies)}</worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
+    return "".join(meshes), ground + "".join(bodies)
+
+
+def set_velocity(qvel: np.ndarray, p: Any, state: ds.State) -> None:
+    """Of the free bodies, which come first."""
     moving = p.kind == 0
-    velocity = data.qvel.reshape(-1, 6)
+    velocity = qvel[: 6 * moving.sum()].reshape(-1, 6)
     velocity[:, :3] = state.velocity[moving]
     for k, body in enumerate(np.flatnonzero(moving)):  # MuJoCo's is in the body's frame
         mujoco.mju_rotVecQuat(
@@ -95,7 +136,13 @@ def frictionless(
             state.angular_velocity[body].numpy(),
             state.orientation[body].numpy() * [1.0, -1.0, -1.0, -1.0],
         )
-    return model, data
+
+
+def contact_attributes(friction: np.ndarray) -> str:
+    """Of geoms and flexes, for the coefficients of all objects."""
+    if np.ptp(friction) > 0.0:
+        raise ValueError(f"MuJoCo's side: all objects must have the same coefficient of friction, got {friction}")
+    return f'condim="3" friction="{_numbers(friction[0])} 0 0"' if friction[0] > 0.0 else 'condim="1"'
 
 
 def _numbers(values: ArrayLike) -> str:

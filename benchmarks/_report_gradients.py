@@ -1,4 +1,4 @@
-"""Gradients of the work-precision report. One entry of `GRADIENTS` is one scene.
+"""Gradients of the work-precision report. One entry of `CONTACT_GRADIENTS` is one scene.
 
 Two errors are told apart: of the gradient from that of the discrete steps that were run, and of either from the
 gradient of the motion in continuous time, which is what someone who asks for one means.
@@ -13,16 +13,21 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from _mujoco import frictionless
-from _report_scenes import ball_on_sheet, landing, oblique, push, stack, two_balls
+from _mujoco import Settings, model_of
+from _report_cloth import ball_on_sheet, figurine_on_sheet
+from _report_impacts import landing, oblique, push, stack, two_balls
 from torch import Tensor
 
 import diffsim as ds
 
-Place = tuple[str, tuple[int, ...]]  # a field of the state or a parameter, and an index into it
+# A field of the state or a parameter, and an index into it; a list in it is of entries that are one number.
+Place = tuple[str, tuple["int | list[int]", ...]]
 Loss = Callable[[ds.State], Tensor]
 DIFFERENCES = 1e-5  # step of central differences, of values of order one
+WIDE = 1e-2  # another, for MuJoCo: it averages over what jumps from step to step
 SHARP = 1e-13  # tolerance of the runs that gradients of the discrete steps are known from
+ADJOINTS = tuple((name, {"adjoint": name}) for name in ("exact", "qr", "dense"))
+MODES = (*ADJOINTS, ("trapezoidal", {"integrator": "trapezoidal"}))
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,9 @@ class GradientScene:
     loss: Loss  # of the last state
     exact: Callable[[Tensor, Inputs], Tensor] | None = None  # the loss as a closed form of the inputs
     limit_dt: float | None = None  # without closed form: from differences with this dt and twice it [s]
-    mujoco: Sequence[str] = ("Euler", "implicitfast", "RK4")
+    ours: Sequence[tuple[str, dict[str, str]]] = MODES  # names and options of simulators
+    # By central differences. What is in contact, implicitfast does as Euler.
+    mujoco: Sequence[Settings] = (Settings("Euler"), Settings("RK4"))
     quick: bool = False  # part of quick runs
 
 
@@ -49,7 +56,7 @@ class Inputs:
         self.sim = ds.Simulator(case.build(), dt, num_threads=1, **options)
         self.start = self.sim.initial_state()
         self.count = round(case.duration / dt)
-        self.values = torch.stack([self._field(name)[index] for name, index in case.inputs]).detach()
+        self.values = torch.stack([self._field(name)[index].flatten()[0] for name, index in case.inputs]).detach()
 
     def _field(self, name: str) -> Tensor:
         return getattr(self.start if hasattr(self.start, name) else self.sim, name).detach()
@@ -94,7 +101,7 @@ def central_differences(loss: Callable[[Tensor], float], values: Tensor, eps: fl
     return np.array(result)
 
 
-def mujoco_differences(case: GradientScene, dt: float, integrator: str) -> Callable[[], np.ndarray]:
+def mujoco_differences(case: GradientScene, dt: float, settings: Settings, eps: float) -> Callable[[], np.ndarray]:
     """Central differences through MuJoCo; its models are made before, and not timed."""
     inputs = Inputs(case, dt)
     scene, models = case.build(), {}
@@ -104,8 +111,8 @@ def mujoco_differences(case: GradientScene, dt: float, integrator: str) -> Calla
         key = tuple(values.tolist())
         if key not in models:
             state, parameters = inputs.placed(values)
-            mass = parameters.get("mass", inputs.sim.mass).detach().numpy()
-            model, data = frictionless(scene, state, dt=dt, integrator=integrator, mass=mass)
+            given = {name: parameters[name].detach().numpy() for name in ("mass", "friction") if name in parameters}
+            model, data = model_of(scene, state, dt=dt, settings=settings, **given)
             start = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
             mujoco.mj_getState(model, data, start, mujoco.mjtState.mjSTATE_FULLPHYSICS)
             models[key] = model, data, start
@@ -120,8 +127,8 @@ def mujoco_differences(case: GradientScene, dt: float, integrator: str) -> Calla
         position[moving] = torch.from_numpy(data.qpos.reshape(-1, 7)[:, :3].copy())
         return float(case.loss(inputs.start.replace(position=position)))
 
-    central_differences(loss, inputs.values, DIFFERENCES)  # makes the models
-    return lambda: central_differences(loss, inputs.values, DIFFERENCES)
+    central_differences(loss, inputs.values, eps)  # makes the models
+    return lambda: central_differences(loss, inputs.values, eps)
 
 
 def continuous(case: GradientScene) -> np.ndarray:
@@ -141,7 +148,7 @@ def relative(found: np.ndarray, right: np.ndarray) -> float:
 # ---- losses and closed forms -----------------------------------------------------------------------------------------
 
 
-def _weighted(end: ds.State) -> Tensor:
+def weighted(end: ds.State) -> Tensor:
     """Of all centres, each coordinate with another weight."""
     weight = torch.arange(1.0, end.position.numel() + 1.0, dtype=torch.float64).reshape(end.position.shape)
     return (weight.cos() * end.position).sum()
@@ -152,36 +159,36 @@ def _after_landing(values: Tensor, inputs: Inputs) -> Tensor:
     state, _ = inputs.placed(values)
     x = state.position[:, :2] + inputs.case.duration * state.velocity[:, :2]
     rest = torch.full((1, 1), 0.2, dtype=torch.float64)
-    return _weighted(inputs.start.replace(position=torch.cat([x, rest], dim=1)))
+    return weighted(inputs.start.replace(position=torch.cat([x, rest], dim=1)))
 
 
 def _after_impact(values: Tensor, inputs: Inputs) -> Tensor:
     state, parameters = inputs.placed(values)
     end = two_balls(state.position, state.velocity, parameters["mass"], inputs.case.duration)
-    return _weighted(inputs.start.replace(position=end))
+    return weighted(inputs.start.replace(position=end))
 
 
 def _slides(values: Tensor, inputs: Inputs) -> Tensor:
     """Boxes of a stack without friction go their way sideways, at the heights of rest."""
     state, _ = inputs.placed(values)
     x = state.position[:, :2] + inputs.case.duration * state.velocity[:, :2]
-    return _weighted(inputs.start.replace(position=torch.cat([x, inputs.start.position[:, 2:]], dim=1)))
+    return weighted(inputs.start.replace(position=torch.cat([x, inputs.start.position[:, 2:]], dim=1)))
 
 
-def _ball_and_sheet(end: ds.State) -> Tensor:
-    return _weighted(end) + end.node_position[:, 2].mean()
+def _body_and_sheet(end: ds.State) -> Tensor:
+    return weighted(end) + end.node_position[:, 2].mean()
 
 
-def _vector(name: str, body: int, axes: Sequence[int] = (0, 1, 2)) -> tuple[Place, ...]:
+def by_vector(name: str, body: int, axes: Sequence[int] = (0, 1, 2)) -> tuple[Place, ...]:
     return tuple((name, (body, axis)) for axis in axes)
 
 
 # ---- the table -------------------------------------------------------------------------------------------------------
 
-_BALLS = (*_vector("position", 0), *_vector("velocity", 0), ("mass", (0,)), ("mass", (1,)))
+_BALLS = (*by_vector("position", 0), *by_vector("velocity", 0), ("mass", (0,)), ("mass", (1,)))
 _STEPS = (0.02, 0.01, 0.005, 0.0025, 0.00125)
 
-GRADIENTS = (
+CONTACT_GRADIENTS = (
     GradientScene(
         "landing",
         "A ball lands and stays",
@@ -189,8 +196,8 @@ GRADIENTS = (
         landing,
         0.8,
         _STEPS,
-        (*_vector("position", 0), *_vector("velocity", 0)),
-        _weighted,
+        (*by_vector("position", 0), *by_vector("velocity", 0)),
+        weighted,
         _after_landing,
     ),
     GradientScene(
@@ -201,7 +208,7 @@ GRADIENTS = (
         0.8,
         _STEPS,
         _BALLS,
-        _weighted,
+        weighted,
         _after_impact,
     ),
     GradientScene(
@@ -212,7 +219,7 @@ GRADIENTS = (
         0.8,
         _STEPS,
         _BALLS,
-        _weighted,
+        weighted,
         _after_impact,
         quick=True,
     ),
@@ -223,8 +230,8 @@ GRADIENTS = (
         stack,
         0.4,
         _STEPS[:4],
-        tuple(place for body in range(5) for place in _vector("velocity", body)),
-        _weighted,
+        tuple(place for body in range(5) for place in by_vector("velocity", body)),
+        weighted,
         _slides,
     ),
     GradientScene(
@@ -234,9 +241,23 @@ GRADIENTS = (
         ball_on_sheet,
         0.15,
         (0.01, 0.005, 0.0025),
-        (*_vector("velocity", 0), ("mass", (0,)), ("cloth_stretch", (0,))),
-        _ball_and_sheet,
+        (*by_vector("velocity", 0), ("mass", (0,)), ("cloth_stretch", (0,))),
+        _body_and_sheet,
         limit_dt=0.000625,
+        ours=ADJOINTS,
+        mujoco=(),
+    ),
+    GradientScene(
+        "figurine_on_cloth",
+        "A figurine falls on a sheet",
+        "own limit, dt → 0",
+        figurine_on_sheet,
+        0.15,
+        (0.01, 0.005, 0.0025),
+        (*by_vector("velocity", 0), ("mass", (0,)), ("cloth_stretch", (0,)), ("cloth_bend", (0,))),
+        _body_and_sheet,
+        limit_dt=0.000625,
+        ours=ADJOINTS,
         mujoco=(),
     ),
 )

@@ -1,10 +1,10 @@
-"""Runs of the work-precision report: one scene, one method, one dt, as trajectories that can be compared."""
+"""What scenes of the work-precision report are made of, and their runs: trajectories that can be compared."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,13 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import torch
-from _mujoco import frictionless
+from _mujoco import Settings, model_of
 
 import diffsim as ds
 
+G = 9.81
 ROUNDS = 3
-SHORT = 0.05  # a run that takes less is timed more often [s]
+SHORT, LONG = 0.05, 1.0  # a run that takes less is timed more often, and one that takes more once [s]
 
 
 class Unstable(RuntimeError):
@@ -54,6 +55,26 @@ class Method:
     own_limit: bool = False  # errors are from its own limit, where scenes have no closed form: it has another model
 
 
+Error = Callable[[Motion, "Motion | None"], float]  # the motion, and the one it is held against where there is one
+
+
+@dataclass(frozen=True)
+class ValueScene:
+    """A scene whose errors are of motions. To add one, add an entry to a table of scenes."""
+
+    name: str
+    title: str
+    reference: str  # what errors are from, in words
+    build: Callable[[], ds.Scene]
+    duration: float  # [s]
+    steps: Sequence[float]  # dt, large to small [s]
+    errors: Mapping[str, Error]  # by the label of their axis
+    methods: Sequence[Method]
+    limit_dt: float | None = None  # of the run errors are from, without closed form [s]
+    quick: bool = False  # part of quick runs
+    note: str = ""  # why a peer is better here, or seems to be
+
+
 def diffsim(name: str = "diffsim", **options: Any) -> Method:
     def prepare(scene: ds.Scene, dt: float, duration: float) -> Run:
         sim = ds.Simulator(scene, dt, num_threads=1, **options)
@@ -75,13 +96,13 @@ def diffsim(name: str = "diffsim", **options: Any) -> Method:
     return Method(name, prepare, ours=True)
 
 
-def mujoco_bodies(integrator: str, *, stiff: bool = False) -> Method:
-    """MuJoCo's steps in C; `stiff`: contacts as stiff as a step lets them be, instead of the default ones."""
+def mujoco_bodies(settings: Settings) -> Method:
+    """MuJoCo's steps in C."""
 
     def prepare(scene: ds.Scene, dt: float, duration: float) -> Run:
         sim = ds.Simulator(scene, dt)  # only for the start and for what measures energies
         start = sim.initial_state()
-        model, data = frictionless(scene, start, dt=dt, integrator=integrator, stiff=stiff)
+        model, data = model_of(scene, start, dt=dt, settings=settings)
         steps, moving = round(duration / dt), torch.from_numpy(scene.pack().kind == 0)
         steps_alone, trajectory = mujoco_runs(model, data, steps)
 
@@ -90,7 +111,7 @@ def mujoco_bodies(integrator: str, *, stiff: bool = False) -> Method:
 
         return Run(steps_alone, motion)
 
-    return Method(f"MuJoCo {integrator}{' stiff' if stiff else ''}", prepare)
+    return Method(settings.name, prepare)
 
 
 def mujoco_runs(model: Any, data: Any, steps: int) -> tuple[Callable[[], object], Callable[[], np.ndarray]]:
@@ -135,13 +156,16 @@ def _as_states(start: ds.State, moving: torch.Tensor, found: np.ndarray, nq: int
     return ds.State(**full, node_position=nothing, node_velocity=nothing)
 
 
-def mujoco_all() -> tuple[Method, ...]:
-    return (
-        mujoco_bodies("Euler"),
-        mujoco_bodies("implicitfast"),
-        mujoco_bodies("RK4"),
-        mujoco_bodies("implicitfast", stiff=True),
-    )
+INTEGRATORS = tuple(Settings(name) for name in ("Euler", "implicitfast", "RK4"))
+MUJOCO_SMOOTH = tuple(map(mujoco_bodies, INTEGRATORS))
+MUJOCO = (*MUJOCO_SMOOTH, mujoco_bodies(Settings("implicitfast", stiff=True)))
+
+HARD = diffsim("diffsim compliance=0", compliance=0.0)
+LOOSE = diffsim("diffsim tolerance=1e-4", tolerance=1e-4)
+TRAPEZOIDAL = diffsim("diffsim trapezoidal", integrator="trapezoidal")
+SPLIT = diffsim("diffsim split", coupling="split")
+SPLIT_ONCE = diffsim("diffsim split 1 Newton", coupling="split", newton_iterations=1)
+TENTHS = (0.04, 0.02, 0.01, 0.005, 0.0025, 0.00125)
 
 
 def timed(run: Callable[[], Any], quick: bool = False) -> tuple[Any, float]:
@@ -149,22 +173,15 @@ def timed(run: Callable[[], Any], quick: bool = False) -> tuple[Any, float]:
 
     `quick`: that one is.
     """
-    start = time.process_time()
-    result = run()
-    if quick:
-        return result, 1e3 * (time.process_time() - start)
-    rounds = ROUNDS if time.process_time() - start > SHORT else 3 * ROUNDS
-    seconds = []
-    for _ in range(rounds):
+    seconds: list[float] = []
+    rounds = 1 if quick else 2
+    while len(seconds) < rounds:
         start = time.process_time()
         result = run()
         seconds.append(time.process_time() - start)
-    return result, 1e3 * statistics.median(seconds)
-
-
-def extrapolated(coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """The limit of errors that halve with dt."""
-    return 2.0 * fine - coarse
+        if len(seconds) == 1 and not quick:
+            rounds += 0 if seconds[0] > LONG else ROUNDS - 1 if seconds[0] > SHORT else 3 * ROUNDS - 1
+    return result, 1e3 * statistics.median(seconds if quick else seconds[1:])
 
 
 def rms(difference: np.ndarray) -> float:
@@ -174,7 +191,7 @@ def rms(difference: np.ndarray) -> float:
 
 def penetration(scene: ds.Scene, motion: Motion, samples: int = 50) -> float:
     """Deepest over time, judged for all simulators by the same geometry, that of MuJoCo [m]."""
-    model, data = frictionless(scene, motion.start, dt=motion.dt)
+    model, data = model_of(scene, motion.start, dt=motion.dt)
     moving = torch.from_numpy(scene.pack().kind == 0)
     count = len(motion.states.position)
     deepest = 0.0
@@ -186,7 +203,7 @@ def penetration(scene: ds.Scene, motion: Motion, samples: int = 50) -> float:
     return deepest
 
 
-def energy_made(motion: Motion) -> float:
+def energy_made(motion: Motion, _: Motion | None = None) -> float:
     """The largest rise of the energy above an earlier value, as a part of what the scene lost in all."""
     sim, states = motion.sim, motion.states
     energy = sim.kinetic_energy(states) + sim.potential_energy(states)

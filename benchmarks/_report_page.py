@@ -15,6 +15,7 @@ from typing import Any
 from _common import draw_curves, installed_version, processor, save_plot
 
 FLOOR = 1e-14  # errors below are drawn there
+ALONE = 1.5  # load of a machine on which nothing else runs, at most
 Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 
 
@@ -87,12 +88,14 @@ def verdict(panel: Panel) -> str:
 
 
 def machine(note: str, packages: Sequence[str]) -> list[str]:
-    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     versions = [f"Python {platform.python_version()}", *(f"{name} {installed_version(name)}" for name in packages)]
+    shared = f"**Other work ran on the machine at the same time** (load {load:.1f} at the end): it makes times longer."
     return [
-        f"{datetime.date.today().isoformat()}; {processor()}, {os.cpu_count()} cores{load}, {platform.system()}.",
+        f"{datetime.date.today().isoformat()}; {processor()}, {os.cpu_count()} cores, {platform.system()}.",
         ", ".join(versions) + ".",
         "Times are on the processor, one thread, medians; ratios within this run hold, digits do not.",
+        *([shared] if load > ALONE else []),
         *([note] if note else []),
     ]
 

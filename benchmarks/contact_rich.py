@@ -50,7 +50,7 @@ from _common import (
     slope,
 )
 from _contact_scenes import scan_on_scan, specks, wire_under_sheet
-from _mujoco import faster, frictionless, set_friction, ways_to_step
+from _mujoco import faster, model_of, set_friction, ways_to_step
 
 import diffsim as ds
 from diffsim import scenes
@@ -126,7 +126,7 @@ class Run:
         self.steps = steps
         self.mujoco: dict[str, Callable[[], object]] = {}
         if case.in_mujoco:
-            model, data = frictionless(scene, self.start, dt=DT)
+            model, data = model_of(scene, self.start, dt=DT)
             if case.friction > 0.0:
                 set_friction(model, case.friction)
             if case.settle:
@@ -230,7 +230,7 @@ def measure_batch(options: argparse.Namespace) -> dict[str, Any]:
         with torch.no_grad():
             sim.rollout(start, controls, steps)
 
-    model, data = frictionless(scene, sim.initial_state(), dt=DT)
+    model, data = model_of(scene, sim.initial_state(), dt=DT)
     initial = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, initial, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     pushed = np.zeros((count, steps, model.nbody, 6))  # body 0 is the world

@@ -18,6 +18,14 @@ def pytest_report_header() -> str:
     return f"diffsim: {spec.origin if spec else 'not found'}, torch {version('torch')}"
 
 
+if find_spec("hypothesis"):
+    from hypothesis import settings
+
+    settings.register_profile("quick", max_examples=25, deadline=None, derandomize=True, database=None)
+    settings.register_profile("long", max_examples=2000, deadline=None)
+    settings.load_profile("quick")
+
+
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     torch.manual_seed(0)

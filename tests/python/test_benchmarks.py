@@ -33,11 +33,25 @@ COLUMNS = {
     "overhead": ("run", "nothing_forward_us", "backward_ratio"),
     "pay_for_use": ("case", "what", "step_us", "ratio", "tape_bytes_per_step", "module_mb"),
     "relative_scale": ("scale", "forward_backward_s", "memory_mb", "most_iterations"),
-    "work_precision": ("scene", "what", "name", "dt_s", "time_ms", "error"),
+    "work_precision": ("scene", "what", "name", "run", "failure", "dt_s", "time_ms", "error"),
     "threads": ("cubes", "threads", "forward_s", "backward_speedup"),
 }
 POSITIVE = ("_s", "_ms", "_us")  # endings of columns that are times
-TEXT = ("mode", "step", "scene", "material", "name", "case", "directions", "peer", "what", "state", "gradient")
+TEXT = (
+    "mode",
+    "step",
+    "scene",
+    "material",
+    "name",
+    "case",
+    "directions",
+    "peer",
+    "what",
+    "state",
+    "gradient",
+    "run",
+    "failure",
+)
 
 for package in ("matplotlib", "mujoco", "ipctk"):
     pytest.importorskip(package, reason="the benchmarks' packages: pip install .[bench]")

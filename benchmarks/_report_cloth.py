@@ -1,0 +1,127 @@
+"""Cloth without friction in the work-precision report, alone and with what falls on it."""
+
+from __future__ import annotations
+
+import numpy as np
+from _cloth_scenes import DAMPING, DENSITY, POISSON, THICK, YOUNG
+from _contact_scenes import scan
+from _report_flex import MUJOCO_SHEETS
+from _report_motion import LOOSE, SPLIT, SPLIT_ONCE, Motion, ValueScene, at_times, diffsim, rms
+
+import diffsim as ds
+
+NODES = 11
+
+
+def sheet_material() -> ds.ClothMaterial:
+    return ds.ClothMaterial.isotropic(YOUNG, THICK, DENSITY, POISSON, DAMPING)
+
+
+def swinging_sheet() -> ds.Scene:
+    scene = ds.Scene()
+    pinned = [0, NODES - 1]
+    scene.add_cloth(ds.shapes.sheet(1.0, NODES), sheet_material(), pinned=pinned, margin=0.5 * THICK)
+    return scene
+
+
+def ball_on_sheet() -> ds.Scene:
+    """A ball falls on a sheet held at its corners."""
+    scene = ds.Scene()
+    corners = [0, NODES - 1, NODES * (NODES - 1), NODES**2 - 1]
+    scene.add_sphere(0.1, mass=0.3, position=(0.013, 0.007, 0.12), velocity=(0.0, 0.0, -1.0), name="ball")
+    scene.add_cloth(ds.shapes.sheet(1.0, NODES), sheet_material(), pinned=corners, margin=0.5 * THICK)
+    return scene
+
+
+def figurine_on_sheet() -> ds.Scene:
+    """A lumpy thing of 180 faces, which is not convex, in the ball's place."""
+    scene = ds.Scene()
+    corners = [0, NODES - 1, NODES * (NODES - 1), NODES**2 - 1]
+    scene.add_body(scan(180), mass=0.3, position=(0.013, 0.007, 0.13), velocity=(0.0, 0.0, -1.0), name="figurine")
+    scene.add_cloth(ds.shapes.sheet(1.0, NODES), sheet_material(), pinned=corners, margin=0.5 * THICK)
+    return scene
+
+
+BALL = 0.25  # of what a sheet is draped over [m]
+
+
+def draped(friction: float = 0.0) -> ds.Scene:
+    """A sheet is laid over a ball, off its middle: without friction it slides down."""
+    scene = ds.Scene()
+    scene.add_sphere(BALL, kind="static", friction=friction)
+    place = (0.05, 0.03, BALL + THICK)
+    sheet = ds.shapes.sheet(1.0, NODES)
+    scene.add_cloth(sheet, sheet_material(), position=place, margin=0.5 * THICK, friction=friction)
+    return scene
+
+
+def in_the_ball(motion: Motion, _: Motion | None) -> float:
+    """How deep a node is at most [m]."""
+    return max(0.0, BALL - float(motion.states.node_position.norm(dim=-1).min()))
+
+
+def nodes_error(motion: Motion, limit: Motion | None) -> float:
+    assert limit is not None
+    times = np.linspace(0.5, 1.0, 3) * motion.times()[-1]
+    found, exact = (at_times(m, m.states.node_position.numpy(), times) for m in (motion, limit))
+    return rms(found - exact)
+
+
+def body_error(motion: Motion, limit: Motion | None) -> float:
+    assert limit is not None
+    return rms((motion.states.position[-1] - limit.states.position[-1]).numpy())
+
+
+_SINKS = "MuJoCo's limit is that of its own soft contacts: how deep things sink into the sheet is no error here."
+
+# ---- the table -------------------------------------------------------------------------------------------------------
+
+CLOTH = (
+    ValueScene(
+        "swing",
+        "A sheet held by two corners swings",
+        "each simulator's own limit",
+        swinging_sheet,
+        0.4,
+        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        {"nodes (rms) [m]": nodes_error},
+        (diffsim(), LOOSE, SPLIT_ONCE, *MUJOCO_SHEETS),
+        limit_dt=0.0003125,
+        quick=True,
+    ),
+    ValueScene(
+        "ball_on_sheet",
+        "A ball falls on a sheet",
+        "each simulator's own limit; splits': the monolithic one's",
+        ball_on_sheet,
+        0.2,
+        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        {"nodes (rms) [m]": nodes_error, "ball at the end [m]": body_error},
+        (diffsim(), SPLIT, SPLIT_ONCE, *MUJOCO_SHEETS),
+        limit_dt=0.0003125,
+        note=_SINKS,
+    ),
+    ValueScene(
+        "figurine_on_sheet",
+        "A figurine falls on a sheet (MuJoCo: its convex hull)",
+        "each simulator's own limit; splits': the monolithic one's",
+        figurine_on_sheet,
+        0.2,
+        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        {"nodes (rms) [m]": nodes_error, "figurine at the end [m]": body_error},
+        (diffsim(), SPLIT, SPLIT_ONCE, MUJOCO_SHEETS[0]),
+        limit_dt=0.0003125,
+        note=_SINKS,
+    ),
+    ValueScene(
+        "drape",
+        "A sheet is draped over a ball",
+        "each simulator's own limit, and no depth",
+        draped,
+        0.3,
+        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        {"nodes (rms) [m]": nodes_error, "deepest penetration of a node [m]": in_the_ball},
+        (diffsim(), LOOSE, SPLIT, *MUJOCO_SHEETS),
+        limit_dt=0.0003125,
+    ),
+)
