@@ -251,10 +251,11 @@ def test_estimate_mass_fails_where_velocities_are_damped(
     descent = module.descend(1.0)
     assert descent.masses[-1] == pytest.approx(5.46, abs=0.01)  # as the paper has it
     recording = module.Recording()
-    jacobian = torch.eye(5, dtype=torch.float64).repeat(43, 1)
-    fit = module.Fit(torch.zeros(5, dtype=torch.float64), jacobian, module.NOISE, [])
-    five = torch.ones(5, dtype=torch.float64)
-    assert not module.check(descent, recording, fit, module.Coverage(40, 38 * five, five))
+    count = len(module.NAMES)
+    jacobian = torch.eye(count, dtype=torch.float64).repeat(43, 1)
+    fit = module.Fit(torch.zeros(count, dtype=torch.float64), jacobian, module.NOISE, [])
+    ones = torch.ones(count, dtype=torch.float64)
+    assert not module.check(descent, recording, fit, module.Coverage(40, 38 * ones, ones))
     wrong = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL ")]
     assert len(wrong) == 2
     assert all("collision: " in line for line in wrong)
