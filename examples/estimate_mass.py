@@ -1,4 +1,4 @@
-"""Masses from motion: one from the momentum of a collision, then mass, inertia and stiffness from a noisy recording.
+"""Masses from motion: one from the momentum of a collision; mass, inertia, friction and more from a noisy recording.
 
 **The collision**, Fig. 9 of Qiao et al. 2020. Two cubes of edge 0.2 m meet head-on at ±v without gravity and stay
 together. The first has mass m1, the other 1 kg; the total momentum after 0.4 s shall be (3, 0, 0) kg·m/s. Gradient
@@ -8,13 +8,14 @@ collision does to either cube. At v = 1 m/s that is 4 kg. The published 5.4 kg i
 every velocity; this one conserves.
 
 **The recording.** A box of unknown mass and inertia is pushed and twisted by known forces and torques, and falls on a
-sheet pinned at its corners, of unknown stretch stiffness. Four corners of the box and five nodes of the sheet are seen
-seven times in 0.28 s, with noise of 0.2 mm. Gauss-Newton steps with the layer's Jacobian find the five logarithms
-(mass, three moments of inertia, stiffness) that fit best. The first steps look at the first frames only: far from the
-truth the box lands otherwise, and what comes after misleads. The Jacobian J of the fit gives a covariance s² (JᵀJ)⁻¹,
-with s² the mean squared residual, and so intervals of 95 %. Whether they are that: the fit is made again for 200 draws
-of the noise, in one batch, and the truth must lie in the interval as often as it claims, and the spread of the fits
-must be the claimed one.
+sheet pinned at its corners, of unknown stretch stiffness, on which it slides with unknown friction. Four corners of the
+box and five nodes of the sheet are seen seven times in 0.28 s, with noise of 0.2 mm. Gauss-Newton steps with the
+layer's Jacobian find the six logarithms (mass, three moments of inertia, stiffness, Coulomb's coefficient) that fit
+best; friction shows as long as something slips, and here it does. The first steps look at the first frames only: far
+from the truth the box lands otherwise, and what comes after misleads. The Jacobian J of the fit gives a covariance
+s² (JᵀJ)⁻¹, with s² the mean squared residual, and so intervals of 95 %. Whether they are that: the fit is made again
+for 200 draws of the noise, in one batch, and the truth must lie in the interval as often as it claims, and the spread
+of the fits must be the claimed one.
 
 Writes out/estimate_mass.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
 """
@@ -117,11 +118,12 @@ def _named(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
 
 DT, STEPS, EVERY = 0.01, 28, 4  # a frame every EVERY steps [s]
 NODES, SIDE = 5, 0.6  # of the sheet along a side [m]
+FRICTION = 0.3  # of box and sheet; only their coefficient together can be told
 SHEET = ds.ClothMaterial(density=0.3, stretch=300.0, shear=100.0, bend=1e-4, damping=0.01)
 CORNERS, SEEN_NODES = (0, 3, 5, 6), (6, 8, 12, 16, 18)  # of the box and of the sheet, whose places are recorded
 NOISE = 2e-4  # standard deviation of each coordinate [m]
-NAMES = ("mass", "inertia x", "inertia y", "inertia z", "stretch")
-FIRST_GUESS = (-0.25, 0.3, 0.3, -0.3, 0.35)  # error of the logarithms at first
+NAMES = ("mass", "inertia x", "inertia y", "inertia z", "stretch", "friction")
+FIRST_GUESS = (-0.25, 0.3, 0.3, -0.3, 0.35, 0.4)  # error of the logarithms at first
 FRAMES = (2, 3, 4, 5, 7, 7)  # that Gauss-Newton steps look at
 REFITS = 3  # steps with the Jacobian of the fit, for other noise
 DRAWS, QUICK_DRAWS = 200, 40
@@ -136,18 +138,21 @@ class Recording(nn.Module):
         scene = ds.Scene()
         last = NODES * NODES - 1
         pinned = [0, NODES - 1, last - NODES + 1, last]
-        self.sheet = scene.add_cloth(ds.shapes.sheet(SIDE, NODES), SHEET, pinned=pinned, name="sheet")
+        sheet = ds.shapes.sheet(SIDE, NODES)
+        self.sheet = scene.add_cloth(sheet, SHEET, pinned=pinned, friction=FRICTION, name="sheet")
         self.box = scene.add_body(
             ds.shapes.box((0.10, 0.14, 0.08)),
             mass=0.3,
-            position=(0.02, -0.01, 0.1),
+            position=(0.02, -0.01, 0.11),
             orientation=ds.rotation.from_rpy([0.3, 0.2, 0.1]),
             angular_velocity=(3.0, -2.0, 4.0),
+            friction=FRICTION,
             name="box",
         )
         sim = ds.Simulator(scene, dt=DT)
         self.rollout, self.start, self.control = Rollout(sim, STEPS), sim.initial_state(), self.pushes()
-        self.truth = {name: getattr(sim, name).detach().clone() for name in ("mass", "inertia", "cloth_stretch")}
+        unknown = ("mass", "inertia", "cloth_stretch", "friction")
+        self.truth = {name: getattr(sim, name).detach().clone() for name in unknown}
         box_vertices = 8  # which come before the nodes
         self.seen = torch.tensor([*CORNERS, *(box_vertices + node for node in SEEN_NODES)])
 
@@ -166,7 +171,8 @@ class Recording(nn.Module):
             "mass": self.truth["mass"] * factor[:1],
             # The box's axes are the principal ones.
             "inertia": self.truth["inertia"] * torch.diag_embed(factor[1:4]),
-            "cloth_stretch": self.truth["cloth_stretch"] * factor[4:],
+            "cloth_stretch": self.truth["cloth_stretch"] * factor[4:5],
+            "friction": self.truth["friction"] * factor[5:],
         }
         return functional_call(self.rollout, _named(parameters), (self.start, self.control))
 
@@ -178,8 +184,8 @@ class Recording(nn.Module):
 
 @dataclass
 class Fit:
-    logarithms: Tensor  # (5,)
-    jacobian: Tensor  # (seen, 5) [m]
+    logarithms: Tensor  # (6,)
+    jacobian: Tensor  # (seen, 6) [m]
     deviation: float  # s, the root of the mean squared residual [m]
     history: list[float]  # root of the mean squared residual, per iteration [m]
 
@@ -216,8 +222,8 @@ def _twice(recording: Recording, count: int, logarithms: Tensor) -> tuple[Tensor
 @dataclass
 class Coverage:
     draws: int
-    inside: Tensor  # times the truth was in the interval, per parameter, (5,)
-    spread: Tensor  # standard deviation of the fits over the claimed one, (5,)
+    inside: Tensor  # times the truth was in the interval, per parameter, (6,)
+    spread: Tensor  # standard deviation of the fits over the claimed one, (6,)
 
 
 def cover(recording: Recording, main: Fit, draws: int, seed: int) -> Coverage:
@@ -266,7 +272,7 @@ def check(descent: Descent, recording: Recording, main: Fit, coverage: Coverage)
     results.append((text, distance <= most))
 
     draws = coverage.draws
-    share = RARE / len(NAMES)  # all five parameters are asked
+    share = RARE / len(NAMES)  # all parameters are asked
     low, high = (int(stats.binom.ppf(p, draws, LEVEL)) for p in (0.5 * share, 1.0 - 0.5 * share))
     listed = ", ".join(f"{name} {int(n)}" for name, n in zip(NAMES, coverage.inside))
     text = f"intervals of {100 * LEVEL:.0f} % hold the truth in {low} to {high} of {draws} draws: {listed}"

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # When gradients mislead
 #
-# The gradients here are those of the steps that were run, to rounding. Exact is not the same as useful. Three ways in
-# which an exact gradient tells little about where to go, and what helps: an earlier loss, several starts, and sampling
-# beside gradients.
+# The gradients here are those of the steps that were run, to rounding. Exact is not the same as useful. Four ways in
+# which an exact gradient tells little about where to go, and what helps: an earlier loss, several starts, friction that
+# grows, and sampling beside gradients.
 
 # %%
 import matplotlib.pyplot as plt
@@ -107,6 +107,64 @@ nearest = (trajectory.position[:, :, ball] - trajectory.position[:, :, crate]).n
 toward = -pull[:, ball, 0] * starts  # negative: descending it leads to the crate
 print(f"with that term {int((pull[dead, ball, 0] == 0.0).sum())} starts have no gradient")
 assert (toward[dead & (starts.abs() > 0.2)] < 0.0).all()
+
+# %% [markdown]
+# ## Stiction
+#
+# A crate with friction, pushed for 0.3 s and then left alone. It sticks until the push is more than friction can hold,
+# μ m g, and until then where it ends does not depend on the push at all: the derivative is zero to rounding, as it
+# should be, and says nothing of how much is missing.
+
+# %%
+scene = ds.Scene()
+scene.add_ground(friction=0.5)
+crate = scene.add_body(ds.shapes.box(0.3), density=100.0, position=(0.0, 0.0, 0.1502), friction=0.5, name="crate")
+sim = ds.Simulator(scene, dt=0.02)
+bound = 0.5 * sim.mass[crate].item() * 9.81  # [N]
+STEPS, PUSHED = 45, 15
+
+
+def slide(pushes, friction=1.0):
+    """Where the crate ends along x [m], for a batch of pushes [N], with a part of its friction."""
+    force = torch.zeros(STEPS, len(pushes), 1, 3)
+    force[:PUSHED, :, crate, 0] = pushes
+    parameters = {"friction": friction * sim.friction.detach()}
+    state = sim.initial_state(batch=len(pushes))
+    return sim.rollout(state, ds.Control(force=force), STEPS, parameters=parameters).position[-1, :, crate, 0]
+
+
+pushes = torch.linspace(0.0, 2.5 * bound, COUNT // 2).requires_grad_()
+figure, axes = plt.subplots(figsize=(5, 3))
+for part in (1.0, 0.5, 0.25):
+    x = slide(pushes, part)
+    (slope,) = torch.autograd.grad(x.sum(), pushes)
+    axes.plot(pushes.detach() / bound, x.detach(), label=f"{part:g} of its friction")
+    stuck = (slope.abs() < 1e-12).double().mean().item()
+    print(f"{part:g} of its friction: no gradient at {100 * stuck:.0f} % of the pushes")
+    assert 0.0 < stuck < 0.5
+axes.set(xlabel="push, in units of μ m g", ylabel="where the crate ends [m]", ylim=(None, 2.0))
+axes.legend()
+
+# %% [markdown]
+# What helps: several starts, as above. Or friction that grows: with little of it the crate moves and there is a slope
+# to follow, and from one coefficient to the next the last push is nearly right. Here: the push that takes the crate to
+# 0.5 m, from one that does not move it, by Newton steps on the one equation there is.
+
+# %%
+target = 0.5
+push = torch.tensor([0.5 * bound])
+for part in (0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0):
+    x = slide(push.requires_grad_(), part)
+    (slope,) = torch.autograd.grad(x.sum(), push)
+    print(f"{part:g} of its friction: {push.item():.2f} N takes it to {x.item():.3f} m, slope {slope.item():.3f} m/N")
+    push = (push - (x - target) / slope).detach()
+reached = slide(push).item()
+print(f"{push.item():.2f} N takes it to {reached:.4f} m")
+assert abs(reached - target) < 1e-3
+
+# %% [markdown]
+# A third way is to say what is missing: what holds a crate that sticks has no gradient, but what it could be held with
+# has. `sim.contacts(state, control).normal_force` times μ, less the push, is a term that pulls until the crate moves.
 
 # %% [markdown]
 # ## Discontinuities

@@ -191,6 +191,21 @@ def test_balance_ball_plays_ppo(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0.0 < curve.held[-1] < module.SIDE
 
 
+def test_card_house_falls_to_the_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert load("card_house").main(["--quick", "--out", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "FAIL" not in output
+    assert output.count("ok  ") == 11
+    assert (tmp_path / "card_house.png").stat().st_size > 10_000
+
+
+def test_card_house_slides_apart_where_it_is_slippery() -> None:
+    house = load("card_house")
+    stands, slides = (house.stand(friction, 0.04, levels=2) for friction in (0.5, 0.25))
+    assert stands.drift < house.DRIFT < slides.drift
+    assert stands.slipping == 0 < slides.slipping
+
+
 EVERY = sorted(path.stem for path in EXAMPLES.glob("[a-z]*.py"))
 
 
@@ -251,10 +266,11 @@ def test_estimate_mass_fails_where_velocities_are_damped(
     descent = module.descend(1.0)
     assert descent.masses[-1] == pytest.approx(5.46, abs=0.01)  # as the paper has it
     recording = module.Recording()
-    jacobian = torch.eye(5, dtype=torch.float64).repeat(43, 1)
-    fit = module.Fit(torch.zeros(5, dtype=torch.float64), jacobian, module.NOISE, [])
-    five = torch.ones(5, dtype=torch.float64)
-    assert not module.check(descent, recording, fit, module.Coverage(40, 38 * five, five))
+    count = len(module.NAMES)
+    jacobian = torch.eye(count, dtype=torch.float64).repeat(43, 1)
+    fit = module.Fit(torch.zeros(count, dtype=torch.float64), jacobian, module.NOISE, [])
+    ones = torch.ones(count, dtype=torch.float64)
+    assert not module.check(descent, recording, fit, module.Coverage(40, 38 * ones, ones))
     wrong = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL ")]
     assert len(wrong) == 2
     assert all("collision: " in line for line in wrong)
