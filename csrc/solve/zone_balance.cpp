@@ -13,7 +13,7 @@ constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
 constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is known of the last model's bounds alone
 constexpr double kRest = 1e-12;  // of the forces: a model that moves nothing further has found the balance
-constexpr int kStandsStill = 6;  // models in balance without halving their motion
+constexpr int kStandsStill = 3;  // models in balance without halving their motion
 
 class BalanceSearch {
 public:
