@@ -238,7 +238,7 @@ def main() -> int:
         steps = tuple(scene.steps[:1] if options.quick else scene.steps[:3] if options.reduced else scene.steps)
         measure_gradients(scene, report, steps, options.quick)
         report.write(file)
-    note = "**A reduced run**: three steps of each sweep, scenes of 10 s at most." if options.reduced else ""
+    note = "**A reduced run**: some steps of each sweep, which each scene names, and scenes of 10 s at most." if options.reduced else ""
     if options.quick:
         note = "**A smoke run**: its numbers mean nothing."
     sections = [
