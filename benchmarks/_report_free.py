@@ -138,7 +138,6 @@ FREE = (
         TENTHS,
         {"attitude after 4 s [rad]": _brick_angle, "relative error of the energy": _energy},
         (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
-        quick=True,
     ),
     ValueScene(
         "coin",

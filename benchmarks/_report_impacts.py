@@ -127,7 +127,6 @@ IMPACTS = (
         TENTHS,
         {"height (rms over time) [m]": _landing_height, "deepest penetration [m]": _landing_depth},
         (diffsim(), TRAPEZOIDAL, HARD, *MUJOCO),
-        quick=True,
     ),
     ValueScene(
         "push",

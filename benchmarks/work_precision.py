@@ -198,6 +198,7 @@ INTRODUCTION = (
     "*Friction*: a stack that leans, a box that has stopped and a ball that rolls should not creep or slip at all."
     " MuJoCo's friction gives way with a speed that impratio divides; ours is exact, and slips by rounding.",
 )
+REDUCED = "**A reduced run**: some steps of each sweep, which each scene names, and scenes of 10 s at most."
 GRADIENT_INTRODUCTION = (
     "`exact` keeps the curvature of contacts, `qr` and `dense` leave it out as the paper does and have no friction;"
     " `trapezoidal` is `exact` with the other integrator. Differences are central; MuJoCo's are taken with two"
@@ -238,7 +239,7 @@ def main() -> int:
         steps = tuple(scene.steps[:1] if options.quick else scene.steps[:3] if options.reduced else scene.steps)
         measure_gradients(scene, report, steps, options.quick)
         report.write(file)
-    note = "**A reduced run**: three steps of each sweep, scenes of 10 s at most." if options.reduced else ""
+    note = REDUCED if options.reduced else ""
     if options.quick:
         note = "**A smoke run**: its numbers mean nothing."
     sections = [
