@@ -15,7 +15,7 @@ ipctk = pytest.importorskip("ipctk")
 
 FloatArray = NDArray[np.float64]
 
-PAIRS = 5000  # of each kind
+PAIRS = 2000  # of each kind
 TOLERANCE = 1e-6  # of impacts, as an absolute distance at positions of size one [m]
 # Distances of points of size one that move by one are exact to a few ulps of that, here 4.
 ROUNDING = 1e-15
