@@ -21,7 +21,6 @@ from torch import Tensor
 
 import diffsim as ds
 from diffsim import _core
-from diffsim._check import CLOTH_PARAMETERS
 from diffsim.ops import RolloutCall, rollout
 
 Result = TypeVar("Result")
@@ -254,12 +253,10 @@ class Recorded:
 def tape_bytes(sim: ds.Simulator, start: ds.State, steps: int) -> int:
     """What a rollout keeps for its backward; not public, so asked of the operator."""
     call = RolloutCall(sim._model, sim._options, steps, 1, keep_time=True)
-    state = [value if value.numel() else None for value in (getattr(start, name).detach() for name in STATE_FIELDS)]
-    first = next(value for value in state if value is not None)
-    cloth = [getattr(sim, name) for name in CLOTH_PARAMETERS] if start.node_position.numel() else [None] * 5
+    inputs = sim._checked_inputs("tape_bytes", start.detach(), None, None).inputs
     with torch.enable_grad():
-        first.requires_grad_()
-        rollout(call, *state, *(None,) * 6, sim.mass, sim.inertia, sim.gravity, sim.friction, *cloth)
+        next(t for t in inputs if t is not None).requires_grad_()
+        rollout(call, *inputs)
     assert isinstance(call.tape, _core.Tape)
     return call.tape.nbytes
 

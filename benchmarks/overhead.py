@@ -1,7 +1,7 @@
 """What a step costs beside its physics: one free body, one step, called from Python.
 
-Timed beside a do-nothing autograd.Function of the same arity (21 tensors in, 6 out; those of cloth are None), in turns,
-in the same process: forward through `Simulator.__call__` with gradients recorded, and backward to the whole state.
+Timed beside a do-nothing autograd.Function of the same arity (all inputs, those of cloth None, and the state out), in
+turns, in the same process: forward through `Simulator.__call__` with gradients recorded, and backward to the state.
 Prints one CSV line per run; the ratios should be at most 2.
 """
 
@@ -18,17 +18,18 @@ from _common import in_turns, make_parser, print_header, print_row, repeated
 from torch import Tensor
 
 import diffsim as ds
+from diffsim._input_table import INPUT_COUNT, STATE_COUNT
 
 COLUMNS = ("run", "nothing_forward_us", "step_forward_us", "forward_ratio")
 COLUMNS += ("nothing_backward_us", "step_backward_us", "backward_ratio")
 
 
 class Nothing(torch.autograd.Function):
-    """As `diffsim.ops` has it: an object and 21 tensors (or None) in, 6 tensors (or None) out."""
+    """As `diffsim.ops` has it: an object and tensors (or None) in, tensors (or None) out."""
 
     @staticmethod
     def forward(call: object, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        return tuple(None if t is None else t.clone() for t in inputs[:6])
+        return tuple(None if t is None else t.clone() for t in inputs[:STATE_COUNT])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -36,7 +37,7 @@ class Nothing(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return (None, *grads, *(None,) * 15)
+        return (None, *grads, *(None,) * (INPUT_COUNT - STATE_COUNT))
 
 
 def cases() -> dict[str, Callable[[], object]]:
@@ -46,7 +47,7 @@ def cases() -> dict[str, Callable[[], object]]:
     sim = ds.Simulator(scene, dt=0.01)
     start = sim.initial_state()
     inputs = [t.requires_grad_() for t in (start.position, start.orientation, start.velocity, start.angular_velocity)]
-    arguments = (object(), *inputs, *(None,) * 8, sim.mass, sim.inertia, sim.gravity, sim.friction, *(None,) * 5)
+    arguments = (object(), *sim._checked_inputs("overhead", start, None, None).inputs)
     end = sim(start)
     stepped = (end.position, end.orientation, end.velocity, end.angular_velocity)
     unchanged = Nothing.apply(*arguments)[:4]

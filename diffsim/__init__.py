@@ -3,14 +3,17 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from . import parameters, rotation, shapes
-from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
-from ._units import UnitsWarning
-from .contacts import Contacts
-from .materials import ClothMaterial
-from .scene import BodyHandle, ClothHandle, Scene
-from .simulator import Simulator
-from .state import Control, State
+from .state import Control, State  # at once: torch.load has to know them before it meets one
+
+if TYPE_CHECKING:
+    from . import diagnostics, interop, parameters, rotation, shapes, viewer
+    from ._handles import BodyHandle, ClothHandle
+    from ._outcome import ConvergenceWarning, Failure, FastImpactWarning, GradientError, Info, SolverError
+    from ._units import UnitsWarning
+    from .contacts import Contacts
+    from .materials import ClothMaterial
+    from .scene import Scene
+    from .simulator import Simulator
 
 __all__ = [
     "BodyHandle",
@@ -37,17 +40,31 @@ __all__ = [
 ]
 
 
-if TYPE_CHECKING:
-    from . import diagnostics as diagnostics
-    from . import interop as interop
-    from . import viewer as viewer
-
-_LOADED_WHEN_USED = ("diagnostics", "interop", "viewer")
+# Loaded when it is first asked for: modules, and by its module what else is public.
+_MODULES = ("diagnostics", "interop", "parameters", "rotation", "shapes", "viewer")
+_HOMES = {
+    "BodyHandle": "_handles",
+    "ClothHandle": "_handles",
+    "ClothMaterial": "materials",
+    "Contacts": "contacts",
+    "ConvergenceWarning": "_outcome",
+    "Failure": "_outcome",
+    "FastImpactWarning": "_outcome",
+    "GradientError": "_outcome",
+    "Info": "_outcome",
+    "Scene": "scene",
+    "Simulator": "simulator",
+    "SolverError": "_outcome",
+    "UnitsWarning": "_units",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LOADED_WHEN_USED:
+    if name in _MODULES:
         return import_module(f".{name}", __name__)
+    if name in _HOMES:
+        found = globals()[name] = getattr(import_module(f".{_HOMES[name]}", __name__), name)
+        return found
     if name == "__version__":
         from importlib.metadata import version
 

@@ -9,13 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ._input_table import OF_CLOTH
 from .state import Control, State
 
-# In the order of the core; fields of cloth nodes start with "node".
-STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
-CONTROL_FIELDS = ("force", "torque", "node_force", "body_velocity", "body_angular_velocity", "node_velocity")
-PARAMETERS = ("mass", "inertia", "gravity", "friction")
-CLOTH_PARAMETERS = ("cloth_density", "cloth_stretch", "cloth_shear", "cloth_bend", "cloth_damping")
 FLOAT_DTYPES = (torch.float32, torch.float64)
 
 
@@ -91,7 +87,7 @@ def check_state(where: str, state: Any, body_count: int, node_count: int) -> int
     dtype = check_float_tensor(where, "state.position", state.position).dtype
     batch: int | None = None
     for name, value in state.__dict__.items():
-        count, width = (node_count if name.startswith("node") else body_count), (4 if name == "orientation" else 3)
+        count, width = (node_count if name in OF_CLOTH else body_count), (4 if name == "orientation" else 3)
         tensor = check_float_tensor(where, f"state.{name}", value, dtype)
         if tensor.ndim in (2, 3) and tensor.shape[-2] != count and tensor.shape[-1] == width:
             bodies = "1 body" if body_count == 1 else f"{body_count} bodies"
@@ -129,6 +125,6 @@ def check_control(where: str, control: Any, body_count: int, node_count: int, ba
     for name, value in control.__dict__.items():
         if value is not None:
             tensor = check_float_tensor(where, f"control.{name}", value)
-            count = node_count if name.startswith("node") else body_count
+            count = node_count if name in OF_CLOTH else body_count
             batch = check_shape(where, f"control.{name}", tensor, (count, 3), batch)
     return batch

@@ -5,13 +5,15 @@ Eager calls do not come here: an op of torch.library takes several times as long
 takes tensors and numbers only, so that a simulator goes by a number, and the record a backward needs by a tensor that
 keeps it alive. The record is a matter of speed: a backward that does not find it, because a compiler copied the tensor,
 runs the forward again, to the same bits.
+
+Imported when a simulator is first traced: to register the ops takes a good part of what `import diffsim` may take.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -21,26 +23,11 @@ from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd.function import _SingleLevelFunction
 
 from . import _core
-from ._core_calls import (
-    BASE_NDIM,
-    CONTROLS,
-    INPUT_COUNT,
-    OptionalTensors,
-    RolloutCall,
-    as_arrays,
-    run_backward,
-    run_forward,
-)
+from ._core_calls import OptionalTensors, RolloutCall, as_arrays, run_backward, run_forward
 from ._folding import map_backward, map_forward
+from ._input_table import BASE_NDIM, CONTROLS, INPUT_COUNT, LABELS, STATE_COUNT
+from ._owners import owner_of
 from .ops import FIRST_ORDER_ONLY
-
-
-class Owner(Protocol):
-    """What a simulator is asked for where an op runs."""
-
-    def _make_call(self, steps: int, **settings: Any) -> RolloutCall: ...
-    def _check_unread(self, restitution: Tensor) -> None: ...
-    def _finish_traced(self, info: Any, first_step: int, outputs: OptionalTensors) -> None: ...
 
 
 class _Settings(NamedTuple):
@@ -62,28 +49,12 @@ class _Record(np.ndarray[Any, Any]):
 
 
 _numbers = itertools.count()
-_owners: WeakValueDictionary[int, Owner] = WeakValueDictionary()
 _records: WeakValueDictionary[int, _Record] = WeakValueDictionary()
 
 _SETTINGS = "int owner, int steps, bool controls_have_time, bool keep_time, bool record, bool single, int first_step"
-_INPUTS = ", ".join(f"Tensor? input{i}" for i in range(INPUT_COUNT))
-_OUTPUT_COUNT = 6
-_GRADS = ", ".join(f"Tensor? grad{i}" for i in range(_OUTPUT_COUNT))
+_INPUTS = ", ".join(f"Tensor? {label.replace('.', '_')}" for label in LABELS)
+_GRADS = ", ".join(f"Tensor? grad{i}" for i in range(STATE_COUNT))
 _HEAD = len(_Settings._fields)
-
-
-def enlist(owner: Owner) -> int:
-    """A number by which ops find the simulator, as long as it lives."""
-    number = next(_numbers)
-    _owners[number] = owner
-    return number
-
-
-def _owner(number: int) -> Owner:
-    owner = _owners.get(number)
-    if owner is None:
-        raise RuntimeError("diffsim: the simulator this code was compiled with is no more; compile it again")
-    return owner
 
 
 def rollout(
@@ -102,21 +73,20 @@ def rollout(
     record = keep_tape and torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     settings = (owner, steps, controls_have_time, keep_time, record, single, first_step)
     outputs = torch.ops.diffsim.rollout(*settings, *inputs, values["restitution"])
-    moving, nodes = tuple(outputs[:4]), tuple(outputs[4:_OUTPUT_COUNT])
-    return (*moving, *nodes) if inputs[4] is not None else (*moving, None, None)
+    return tuple(None if given is None else t for given, t in zip(inputs[:STATE_COUNT], outputs))
 
 
 # ---- the forward -----------------------------------------------------------------------------------------------------
 
 # By hand and not by torch.library.custom_op: what that makes of a derivative cannot be called inside torch.func.
 _library = torch.library.Library("diffsim", "DEF")
-_library.define(f"rollout({_SETTINGS}, {_INPUTS}, Tensor restitution) -> ({', '.join(['Tensor'] * 7)})")
+_library.define(f"rollout({_SETTINGS}, {_INPUTS}, Tensor restitution) -> ({', '.join(['Tensor'] * (STATE_COUNT + 1))})")
 _library.define(f"rollout_backward({_SETTINGS}, bool[] needs, Tensor tape, {_INPUTS}, {_GRADS}) -> Tensor[]")
 
 
 def _forward(*args: Any) -> tuple[Tensor, ...]:
     settings, inputs = _Settings(*args[:_HEAD]), args[_HEAD : _HEAD + INPUT_COUNT]
-    owner = _owner(settings.owner)
+    owner = owner_of(settings.owner)
     owner._check_unread(*args[_HEAD + INPUT_COUNT :])
     call = _call_of(settings)
     call.record = settings.record
@@ -127,7 +97,7 @@ def _forward(*args: Any) -> tuple[Tensor, ...]:
 
 
 def _call_of(settings: _Settings) -> RolloutCall:
-    return _owner(settings.owner)._make_call(
+    return owner_of(settings.owner)._make_call(
         settings.steps,
         controls_have_time=settings.controls_have_time,
         keep_time=settings.keep_time,
@@ -159,7 +129,7 @@ def _forward_shapes(*args: Any) -> tuple[Tensor, ...]:
             break
     outputs = [
         inputs[0].new_empty(*leading, 0, 3) if t is None else t.new_empty(*leading, *t.shape[-2:])
-        for t in inputs[:_OUTPUT_COUNT]
+        for t in inputs[:STATE_COUNT]
     ]
     return (*outputs, inputs[0].new_empty(1, dtype=torch.int64))
 
@@ -183,7 +153,7 @@ class _Differentiated(_SingleLevelFunction):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
         needs = list(ctx.needs_input_grad[1 + _HEAD : 1 + _HEAD + INPUT_COUNT])
-        upstream = grads[:_OUTPUT_COUNT]
+        upstream = grads[:STATE_COUNT]
         found = iter(torch.ops.diffsim.rollout_backward(*ctx.settings, needs, *ctx.saved_tensors, *upstream))
         return (*(None,) * (1 + _HEAD), *(next(found) if needed else None for needed in needs), None)
 

@@ -76,6 +76,26 @@ class Options:
     def newton_iterations(self) -> int | None: ...
     integrator: str
 
+class Input:
+    """A line of the table of inputs."""
+
+    @property
+    def label(self) -> str: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def axis(self) -> str: ...
+    @property
+    def row_shape(self) -> tuple[int, ...]: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def allowed(self) -> str: ...
+
+def inputs() -> list[Input]: ...
+
 class Tape:
     """What the backward of a rollout needs."""
 
@@ -163,14 +183,7 @@ def separate(
     position: NDArray[np.float64],
     orientation: NDArray[np.float64],
     node_position: NDArray[np.float64],
-    *,
-    mass: NDArray[np.float64],
-    inertia: NDArray[np.float64],
-    cloth_density: NDArray[np.float64],
-    cloth_stretch: NDArray[np.float64],
-    cloth_shear: NDArray[np.float64],
-    cloth_bend: NDArray[np.float64],
-    cloth_damping: NDArray[np.float64],
+    parameters: list[NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]: ...
 def min_distance(
     model: Model, position: NDArray[np.float64], orientation: NDArray[np.float64], node_position: NDArray[np.float64]

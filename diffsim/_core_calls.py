@@ -10,21 +10,11 @@ import torch
 from torch import Tensor
 
 from . import _core
-from ._check import CLOTH_PARAMETERS, CONTROL_FIELDS, PARAMETERS, STATE_FIELDS, message
+from ._check import message
+from ._input_table import INPUT_COUNT, LABELS
 from ._outcome import gradient_error
 
 OptionalTensors = tuple[Tensor | None, ...]
-
-# The inputs of a call: state, controls, then mass, inertia, gravity, friction and the five of cloth.
-INPUT_NAMES = (
-    *(f"state.{name}" for name in STATE_FIELDS),
-    *(f"control.{name}" for name in CONTROL_FIELDS),
-    *PARAMETERS,
-    *CLOTH_PARAMETERS,
-)
-BASE_NDIM = (*(2,) * 6, *(2,) * 6, 1, 3, 1, 1, *(1,) * 5)  #: of each, without time and batch
-INPUT_COUNT = len(BASE_NDIM)
-CONTROLS = range(6, 12)  #: which of them may have a time axis
 
 _LARGEST, _LARGEST_SINGLE = torch.finfo(torch.float64).max, torch.finfo(torch.float32).max
 
@@ -158,7 +148,7 @@ def as_arrays(tensors: Sequence[Tensor | None]) -> list[Any]:
 
 def _refuse_sparse(inputs: Sequence[Tensor | None]) -> None:
     """Looked for once something has gone wrong: to ask every tensor of every call would take too long."""
-    for name, t in zip(INPUT_NAMES, inputs):
+    for name, t in zip(LABELS, inputs):
         if t is not None and t.layout is not torch.strided:
             raise TypeError(message("Simulator", name, "be a dense tensor (use .to_dense())", t.layout))
 

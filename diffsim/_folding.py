@@ -8,7 +8,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ._core_calls import BASE_NDIM, CONTROLS, INPUT_COUNT, OptionalTensors
+from ._core_calls import OptionalTensors
+from ._input_table import BASE_NDIM, CONTROLS, INPUT_COUNT
 
 Dims = Sequence[int | None]
 

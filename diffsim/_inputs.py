@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from . import _core
 from ._check import (
-    CONTROL_FIELDS,
-    STATE_FIELDS,
     check_control,
     check_count,
     check_float_tensor,
@@ -20,10 +19,11 @@ from ._check import (
     check_state,
     message,
 )
+from ._input_table import CONTROL_FIELDS, INPUT_COUNT, INPUTS, OF_CLOTH, STATE_FIELDS
 from .state import Control, State
 
 Controls = Control | Sequence[Control] | None
-#: Of the operator: 6 of the state, 6 of the control, 9 parameters; those of cloth are None in a scene without.
+#: Of the operator, in the order of the table; those of cloth are None in a scene without.
 Inputs = tuple[Tensor | None, ...]
 
 
@@ -35,77 +35,82 @@ class CheckedInputs(NamedTuple):
     single: bool  #: whether an input came in float32, so that its gradient will be
 
 
-_NOT_DRIVEN = (None,) * 6  # the controls, in the order of the operator
+#: Where an input goes among the operator's (None: nowhere), its name, and the shape that needs no thought.
+_Entries = list[tuple[int | None, str, torch.Size | None]]
 
 
-def plain_inputs(
-    state: Any,
-    control: Any,
-    parameters: Mapping[str, Tensor],
-    state_shapes: tuple[torch.Size, torch.Size, torch.Size],
-    parameter_shapes: Mapping[str, torch.Size],
-) -> Inputs | None:
-    """The operator's inputs in a scene without cloth if nothing has to be converted or complained about; else None.
+class PlainInputs:
+    """The operator's inputs where nothing has to be converted or complained about: float64 tensors, all of the state
+    and the controls with a batch axis or none. Kept fast: it is a good part of what a small step costs in Python.
 
-    Kept fast: it is a good part of what a small step costs in Python. The shapes are those without a batch axis, of
-    position, orientation and nodes, and of the parameters.
+    Args:
+        counts: How many rows there are along each axis of the table.
     """
-    if type(state) is not State:
-        return None
-    f64 = torch.float64
-    vector, quaternion, nodes = state_shapes
-    position, orientation = state.position, state.orientation
-    velocity, angular_velocity = state.velocity, state.angular_velocity
-    mass, inertia, gravity = parameters["mass"], parameters["inertia"], parameters["gravity"]
-    friction = parameters["friction"]
-    try:
-        if position.shape != vector:
-            if position.ndim != 3:
-                return None
-            batch = position.shape[0]
-            vector, quaternion, nodes = (torch.Size((batch, *shape)) for shape in state_shapes)
-        if not (
-            position.dtype is f64
-            and orientation.dtype is f64
-            and velocity.dtype is f64
-            and angular_velocity.dtype is f64
-            and mass.dtype is f64
-            and inertia.dtype is f64
-            and gravity.dtype is f64
-            and friction.dtype is f64
-            and position.shape == vector
-            and orientation.shape == quaternion
-            and velocity.shape == vector
-            and angular_velocity.shape == vector
-            and mass.shape == parameter_shapes["mass"]
-            and inertia.shape == parameter_shapes["inertia"]
-            and gravity.shape == parameter_shapes["gravity"]
-            and friction.shape == parameter_shapes["friction"]
-            and position.is_cpu
-            and orientation.is_cpu
-            and velocity.is_cpu
-            and angular_velocity.is_cpu
-            and mass.is_cpu
-            and inertia.is_cpu
-            and gravity.is_cpu
-            and friction.is_cpu
-            and state.node_position.shape == nodes
-            and state.node_velocity.shape == nodes
-        ):
+
+    def __init__(self, counts: Mapping[str, int]) -> None:
+        self._counts = counts
+        self._position = torch.Size((counts["bodies"], 3))
+        self._single = self._moving(())
+        self._batched = 0, self._single  # the batch size seen last
+        self._parameters = self._entries("parameter", ())
+
+    def _moving(self, leading: tuple[int, ...]) -> tuple[_Entries, _Entries]:
+        return self._entries("state", leading), self._entries("control", leading)
+
+    def _entries(self, kind: str, leading: tuple[int, ...]) -> _Entries:
+        entries: _Entries = []
+        for index, entry in enumerate(INPUTS):
+            if entry.kind != kind:
+                continue
+            shape: torch.Size | None = torch.Size((*leading, *shape_of(entry, self._counts)))
+            used = not _unused(entry.name, self._counts["nodes"])
+            if used or kind == "state":  # a state of another scene must not pass
+                entries.append((index if used else None, entry.name, shape))
+            elif kind == "control":
+                entries.append((None, entry.name, None))
+        return entries
+
+    def find(self, state: Any, control: Any, parameters: Mapping[str, Tensor]) -> Inputs | None:
+        """Them, or None."""
+        if type(state) is not State or not (control is None or type(control) is Control):
             return None
-        driven: tuple[Any, ...] = _NOT_DRIVEN
-        if control is not None:
-            if type(control) is not Control or control.node_force is not None or control.node_velocity is not None:
-                return None
-            force, torque = control.force, control.torque
-            driven = (force, torque, None, control.body_velocity, control.body_angular_velocity, None)
-            for t in driven:
-                if t is not None and not (t.dtype is f64 and t.shape == vector and t.is_cpu):
+        inputs: list[Tensor | None] = [None] * INPUT_COUNT
+        try:
+            shape = state.position.shape
+            of_state, of_control = self._single
+            if shape != self._position:
+                if len(shape) != 3:
                     return None
-    except AttributeError:  # not a tensor
-        return None
-    moving = position, orientation, velocity, angular_velocity, None, None
-    return *moving, *driven, mass, inertia, gravity, friction, None, None, None, None, None
+                if shape[0] != self._batched[0]:
+                    self._batched = shape[0], self._moving((shape[0],))
+                of_state, of_control = self._batched[1]
+            plain = (
+                _take(of_state, state.__dict__, inputs)
+                and (control is None or _take(of_control, control.__dict__, inputs))
+                and _take(self._parameters, parameters, inputs)
+            )
+        except AttributeError:  # not a tensor
+            return None
+        return tuple(inputs) if plain else None
+
+
+def _take(entries: _Entries, values: Mapping[str, Tensor | None], inputs: list[Tensor | None]) -> bool:
+    """Whether all values are plain; then they are among the inputs."""
+    f64 = torch.float64
+    for index, name, shape in entries:
+        t = values[name]
+        if t is None:
+            continue
+        if t.dtype is not f64 or t.shape != shape or not t.is_cpu:
+            return False
+        if index is not None:
+            inputs[index] = t
+    return True
+
+
+def shape_of(entry: _core.Input, counts: Mapping[str, int]) -> torch.Size:
+    """Of an input without time and batch axes."""
+    return torch.Size((*((counts[entry.axis],) if entry.axis else ()), *entry.row_shape))
 
 
 def checked_inputs(
@@ -154,7 +159,7 @@ def _has_single(state: State, controls: Any, parameters: Mapping[str, tuple[Tens
 
 def _unused(name: str, node_count: int) -> bool:
     """Whether the scene has nothing a field speaks of."""
-    return node_count == 0 and name.startswith(("node", "cloth"))
+    return node_count == 0 and name in OF_CLOTH
 
 
 def over_time(
@@ -171,7 +176,7 @@ def over_time(
         arranged[name] = None, False
         if value is not None:
             tensor = check_float_tensor(where, f"controls.{name}", value)
-            shape = (node_count if name.startswith("node") else body_count, 3)
+            shape = (node_count if name in OF_CLOTH else body_count, 3)
             tensor, has_time, batch = _arranged(where, f"controls.{name}", tensor, steps, shape, batch)
             if not _unused(name, node_count):
                 arranged[name] = tensor, has_time
@@ -234,7 +239,7 @@ def _stacked(
                 raise ValueError(
                     f"{where}: controls[{step}].{name} is None, others are not; give it in all steps or none"
                 )
-            count = node_count if name.startswith("node") else body_count
+            count = node_count if name in OF_CLOTH else body_count
             column = [torch.zeros(count, 3, device="cpu") if t is None else t for t in column]
         cast = [t.to(torch.float64) for t in column if t is not None]  # steps may differ in their dtype
         stacked.append(torch.stack(torch.broadcast_tensors(*cast)) if given else None)

@@ -13,6 +13,7 @@ from . import _core, _energies
 from ._check import check_instance, check_placing, check_state, message
 from ._cloth_energy import ClothElements, elastic_energy, node_mass
 from ._handles import BodyHandle, ClothHandle
+from ._input_table import PARAMETERS
 from ._packed import PackedScene
 from .state import State
 
@@ -26,13 +27,17 @@ class Measurements(nn.Module):
     that is not one of this scene.
     """
 
+    # The parameters of the module, `_input_table.MODULE_PARAMETERS`, for whoever checks types.
     mass: nn.Parameter
     inertia: nn.Parameter
     gravity: nn.Parameter
+    friction: nn.Parameter
+    restitution: nn.Parameter
     cloth_density: nn.Parameter
     cloth_stretch: nn.Parameter
     cloth_shear: nn.Parameter
     cloth_bend: nn.Parameter
+    cloth_damping: nn.Parameter
     _packed: PackedScene
     _model: _core.Model
     _options: _core.Options
@@ -266,13 +271,7 @@ class Measurements(nn.Module):
             position,
             orientation,
             node_position,
-            mass=p.mass,
-            inertia=p.inertia,
-            cloth_density=p.cloth_density,
-            cloth_stretch=p.cloth_stretch,
-            cloth_shear=p.cloth_shear,
-            cloth_bend=p.cloth_bend,
-            cloth_damping=p.cloth_damping,
+            [getattr(p, name) for name in PARAMETERS],
         )[:3]
 
     def _node_mass(self) -> Tensor | None:

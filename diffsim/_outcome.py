@@ -121,7 +121,8 @@ class GradientError(RuntimeError):
 
 def gradient_error(model: _core.Model, fault: _core.GradientFault) -> GradientError:
     scene, step, gradients, objects, nodes = fault.args
-    bodies = tuple(model.names[i] for i in objects)
+    names = (*model.names, "ground")  # which is -1
+    bodies = tuple(names[i] for i in objects)
     where = "in the sum over steps and scenes" if step < 0 else f"in step {step} of the rollout, scene {scene}"
     whose = f", of {_listed(list(map(repr, bodies)))}" if bodies else ""
     if nodes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,8 +151,8 @@ def pack_scene(
         cloth_names=[c.name for c in cloths],
         cloth_margin=np.array(cloth_margin, dtype=np.float64),
         **{
-            f"cloth_{field}": np.array([getattr(c.material, field) for c in cloths], dtype=np.float64)
-            for field in ("poisson", "density", "stretch", "shear", "bend", "damping")
+            f"cloth_{field.name}": np.array([getattr(c.material, field.name) for c in cloths], dtype=np.float64)
+            for field in fields(ClothMaterial)
         },
         node_count=np.array([len(s.vertices) for s in sheets], dtype=np.int32),
         triangle_count=np.array([len(s.triangles) for s in sheets], dtype=np.int32),

@@ -14,16 +14,9 @@ from torch import Tensor, nn
 
 from . import _core
 from ._arguments import KINDS
-from ._check import (
-    CLOTH_PARAMETERS,
-    CONTROL_FIELDS,
-    PARAMETERS,
-    STATE_FIELDS,
-    check_count,
-    check_instance,
-    check_number,
-)
+from ._check import check_count, check_instance, check_number
 from ._dump import Replay, dump, replay
+from ._input_table import CONTROL_FIELDS, CONTROLS, INPUTS, OF_CLOTH, PARAMETERS, SCALES, STATE_FIELDS
 from ._inputs import Controls, over_time
 from .simulator import Simulator
 from .state import Control, State
@@ -150,8 +143,8 @@ def gradcheck(
             the controls that are given, and the parameters.
         directions: Random directions per name.
         eps: How far to either side: of positions, velocities and quaternions (along the tangent of the unit sphere) in
-            their units; forces, torques and gravity as far as changes velocities by eps in a step; mass, inertia and
-            the parameters of cloth by 100 eps of their value.
+            their units; forces, torques and gravity as far as changes velocities by eps in a step; all other
+            parameters by 100 eps of their value.
         seed: Of the directions and of the default loss.
         loss: Final state -> scalar tensor. Default: a sum over all entries of the final state with random weights.
         median_tolerance: The largest median error with which `GradcheckReport.passed`.
@@ -184,7 +177,7 @@ def gradcheck(
         moved = {name: values[name] for name in STATE_FIELDS if name in values}
         start = state.to(torch.float64).replace(**moved)
         given = {field: values[name] for field, name in _CONTROL_NAMES.items() if name in values}
-        parameters = {f"sim.{name}": values[name] for name in (*PARAMETERS, *CLOTH_PARAMETERS) if name in values}
+        parameters = {f"sim.{name}": values[name] for name in PARAMETERS if name in values}
         driven: Controls = Control(**given) if given else None
         if driven is not None and isinstance(controls, Sequence):
             driven = list(driven)  # one per step: with as many scenes as steps its first axis could be either
@@ -261,7 +254,7 @@ def contact_systems(sim: Simulator, state: State, control: Control | None = None
     with torch.no_grad():
         inputs = sim._checked_inputs(where, state, control, None).inputs
         arrays = [None if t is None else t.contiguous().numpy(force=True) for t in inputs]
-    if state.leading_shape or any(t is not None and t.ndim > 2 for t in inputs[6:12]):
+    if state.leading_shape or any(t is not None and t.ndim > 2 for t in inputs[CONTROLS.start : CONTROLS.stop]):
         raise ValueError(f"{where}: state and control must have no batch axis")
     result = _core.rollout(
         sim._model,
@@ -281,13 +274,11 @@ def contact_systems(sim: Simulator, state: State, control: Control | None = None
 def _inputs(where: str, sim: Simulator, state: State, controls: Controls, steps: int) -> dict[str, Tensor]:
     """All that can be moved, in float64 and without history; controls with a time axis if they are a sequence."""
     start = state.detach().to(torch.float64)
-    fields, parameters = list(STATE_FIELDS), list(PARAMETERS)
-    if not bool(sim.friction.any()):
-        parameters.remove("friction")  # it moves in proportion, and is not there
-    if sim._node_count:
-        parameters += CLOTH_PARAMETERS
-    else:
-        fields = [name for name in fields if not name.startswith("node")]
+    # A parameter of objects that is zero everywhere, friction, is moved in proportion, and is not there.
+    absent = {i.name for i in INPUTS if i.axis == "objects" and not bool(getattr(sim, i.name).any())}
+    if not sim._node_count:
+        absent |= OF_CLOTH
+    fields, parameters = ([name for name in names if name not in absent] for names in (STATE_FIELDS, PARAMETERS))
     inputs = {name: getattr(start, name) for name in fields}
     if isinstance(controls, Control):
         given = {name: getattr(controls, name) for name in CONTROL_FIELDS}
@@ -316,10 +307,10 @@ def _direction(name: str, inputs: dict[str, Tensor], sim: Simulator, generator: 
     if name == "orientation":
         unit = torch.nn.functional.normalize(value, dim=-1)
         return direction - (direction * unit).sum(-1, keepdim=True) * unit
-    if name in ("mass", "friction", *CLOTH_PARAMETERS):
-        return _PARAMETER_STEP * value * direction
     if name == "inertia":
         return _PARAMETER_STEP * _mean_inertia(value)[..., None, None] * 0.5 * (direction + direction.mT)
+    if name in SCALES:
+        return _PARAMETER_STEP * value * direction
     if name == "gravity":
         return direction / dt
     if name == "force":

@@ -8,8 +8,9 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from ._core_calls import INPUT_NAMES, OptionalTensors, RolloutCall, as_arrays, run_backward, run_forward
+from ._core_calls import OptionalTensors, RolloutCall, as_arrays, run_backward, run_forward
 from ._folding import map_backward, map_forward
+from ._input_table import LABELS
 
 __all__ = ["RolloutCall", "rollout"]
 
@@ -131,7 +132,7 @@ def _any_requires_grad(tensors: Any) -> bool:
 
 def _refuse_tangents(inputs: tuple[Tensor | None, ...]) -> None:
     """Inside a dual level of forward-mode AD. The shortcuts past autograd would drop tangents silently."""
-    for name, t in zip(INPUT_NAMES, inputs):
+    for name, t in zip(LABELS, inputs):
         if t is not None and forward_ad.unpack_dual(t).tangent is not None:
             raise NotImplementedError(
                 f"diffsim: {name} carries a tangent, but there is no forward-mode AD through a step; use reverse mode"
@@ -142,86 +143,20 @@ def _refuse_tangents(inputs: tuple[Tensor | None, ...]) -> None:
 _plain_apply = super(torch.autograd.Function, _Rollout).apply  # without inspect.signature, three quarters of the cost
 
 
-def rollout(
-    call: RolloutCall,
-    position: Tensor,
-    orientation: Tensor,
-    velocity: Tensor,
-    angular_velocity: Tensor,
-    node_position: Tensor | None,
-    node_velocity: Tensor | None,
-    force: Tensor | None,
-    torque: Tensor | None,
-    node_force: Tensor | None,
-    body_velocity: Tensor | None,
-    body_angular_velocity: Tensor | None,
-    node_drive: Tensor | None,
-    mass: Tensor,
-    inertia: Tensor,
-    gravity: Tensor,
-    friction: Tensor,
-    cloth_density: Tensor | None,
-    cloth_stretch: Tensor | None,
-    cloth_shear: Tensor | None,
-    cloth_bend: Tensor | None,
-    cloth_damping: Tensor | None,
-) -> OptionalTensors:
+def rollout(call: RolloutCall, *inputs: Tensor | None) -> OptionalTensors:
     """Advance everything by ``call.steps`` steps, each Eqs. 2 and 6 of Qiao et al. (ICML 2020) as one optimization.
-
-    All tensors are float64 on the cpu. Any may have a batch axis of size B in front of its shape below; if one has,
-    the outputs have. With ``call.controls_have_time`` every control has a time axis of length steps in front of that.
 
     Args:
         call: Model, options, number of steps and threads; receives `info` and the tape.
-        position: Centres of mass, world [m], shape (n, 3).
-        orientation: Unit quaternions w, x, y, z, body to world, shape (n, 4).
-        velocity: Of the centres of mass, world [m/s], shape (n, 3).
-        angular_velocity: World [rad/s], shape (n, 3).
-        node_position: Of cloth, world [m], shape (n_nodes, 3). This and all else of cloth is None in a scene without.
-        node_velocity: World [m/s], shape (n_nodes, 3).
-        force: At the centre of mass, world [N], shape (n, 3), or None for zero.
-        torque: About the centre of mass, world [N·m], shape (n, 3), or None for zero.
-        node_force: World [N], shape (n_nodes, 3), or None for zero.
-        body_velocity: Of kinematic bodies, world [m/s], shape (n, 3), or None: as in the state.
-        body_angular_velocity: Of kinematic bodies, world [rad/s], shape (n, 3), or None: as in the state.
-        node_drive: Velocity of pinned nodes, world [m/s], shape (n_nodes, 3), or None for zero.
-        mass: [kg], shape (n,).
-        inertia: Body frame [kg·m²], shape (n, 3, 3).
-        gravity: [m/s²], shape (3,).
-        friction: Coulomb's coefficients of bodies, cloths and the ground [1], shape (n_objects,).
-        cloth_density: [kg/m²], shape (n_cloths,).
-        cloth_stretch: [N/m], shape (n_cloths,).
-        cloth_shear: [N/m], shape (n_cloths,).
-        cloth_bend: [N·m], shape (n_cloths,).
-        cloth_damping: [s], shape (n_cloths,).
-    Returns: position, orientation, velocity, angular_velocity, node_position, node_velocity after the last step, or,
-        with ``call.keep_time``, after every step with a leading time axis.
+        inputs: State, controls and parameters, as `diffsim._input_table.INPUTS` lists them, float64 on the cpu. Any may
+            have a batch axis of size B in front of its shape; if one has, the outputs have. With
+            ``call.controls_have_time`` every control has a time axis of length steps in front of that. A control that
+            is None is zero, the velocity of kinematic bodies as it is in the state. All of cloth is None in a scene
+            without.
+    Returns: The state after the last step, or, with ``call.keep_time``, after every step with a leading time axis.
     Raises: ValueError for what only the core can judge: not finite, not positive, in penetration.
     Gradients: with respect to all inputs, first order only; the set of active contacts is held fixed.
     """
-    inputs = (
-        position,
-        orientation,
-        velocity,
-        angular_velocity,
-        node_position,
-        node_velocity,
-        force,
-        torque,
-        node_force,
-        body_velocity,
-        body_angular_velocity,
-        node_drive,
-        mass,
-        inertia,
-        gravity,
-        friction,
-        cloth_density,
-        cloth_stretch,
-        cloth_shear,
-        cloth_bend,
-        cloth_damping,
-    )
     if forward_ad._current_level >= 0:
         _refuse_tangents(inputs)
     if not torch.is_grad_enabled():

@@ -9,30 +9,25 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from . import _compiled, _core
-from ._check import (
-    CLOTH_PARAMETERS,
-    PARAMETERS,
-    check_choice,
-    check_count,
-    check_instance,
-    check_number,
-)
+from . import _core
+from ._check import check_choice, check_count, check_instance, check_number
 from ._cloth_energy import cloth_elements
 from ._description import description
 from ._identity import SceneIdentity
+from ._input_table import CONTROLS, MODULE_PARAMETERS, PARAMETERS, STATE_COUNT, STATE_FIELDS
 from ._inputs import (
     CheckedInputs,
     Controls,
+    PlainInputs,
     check_unused,
     checked_inputs,
     checked_parameters,
     checked_steps,
-    plain_inputs,
     state_from,
 )
 from ._measurements import Measurements
 from ._outcome import Info, SolverError, combined, failure_text, warn_of_failure, warn_of_fast_impacts
+from ._owners import enlist
 from ._packed import PackedScene, core_model
 from ._progress import progress_bar
 from .contacts import Contacts, contacts_from
@@ -91,14 +86,6 @@ class Simulator(SceneIdentity, Measurements):
     Raises: TypeError, ValueError for what the message names: overlapping objects, or objects that have no room to keep
         `thickness` apart, among it.
     """
-
-    friction: nn.Parameter
-    restitution: nn.Parameter
-    cloth_density: nn.Parameter
-    cloth_stretch: nn.Parameter
-    cloth_shear: nn.Parameter
-    cloth_bend: nn.Parameter
-    cloth_damping: nn.Parameter
 
     def __init__(
         self,
@@ -169,7 +156,7 @@ class Simulator(SceneIdentity, Measurements):
         self._num_threads = num_threads
         self._on_failure = on_failure
         self._check = check
-        for name in (*PARAMETERS, "restitution", *CLOTH_PARAMETERS):
+        for name in MODULE_PARAMETERS:
             value = torch.from_numpy(np.array(getattr(self._packed, name), dtype=np.float64))
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
         self._info: Info | list[Any] | None = None  # a list of the core's, one per segment, until someone asks
@@ -185,13 +172,13 @@ class Simulator(SceneIdentity, Measurements):
         self._elements = cloth_elements(p, self._model) if p.cloth_names else None
         n = self._body_count = len(p.names)
         self._node_count = len(p.node_rest)
-        self._state_shapes = torch.Size((n, 3)), torch.Size((n, 4)), torch.Size((self._node_count, 3))
-        names = (*PARAMETERS, "restitution", *CLOTH_PARAMETERS)
-        self._parameter_shapes = {name: torch.Size(getattr(p, name).shape) for name in names}
+        self._parameter_shapes = {name: torch.Size(getattr(p, name).shape) for name in MODULE_PARAMETERS}
+        counts = {"bodies": n, "nodes": self._node_count, "objects": len(p.friction), "cloths": len(p.cloth_names)}
+        self._plain_inputs = PlainInputs(counts)
         self._object_names = (*p.names, *p.cloth_names)
         self._cloth_of_node = torch.from_numpy(np.repeat(np.arange(len(p.node_count)), p.node_count))
         self._separated: tuple[np.ndarray, ...] | None = None
-        self._number = _compiled.enlist(self)
+        self._number = enlist(self)
 
     def __getstate__(self) -> dict[str, Any]:
         state = {**self.__dict__, "_info": self.info}
@@ -282,18 +269,19 @@ class Simulator(SceneIdentity, Measurements):
         Gradients: of the step that was run, first order only. A quaternion's gradient is tangent to the unit sphere.
         """
         values = self._values("Simulator", parameters)
-        inputs, single = None, False
+        single = False
         traced = torch.compiler.is_compiling()
-        if not self._node_count and not traced:
-            inputs = plain_inputs(state, control, values, self._state_shapes, self._parameter_shapes)
-        if inputs is None:  # anything but float64 tensors in the plainest shapes
+        inputs = None if traced else self._plain_inputs.find(state, control, values)
+        if inputs is None:
             inputs, _, single = self._checked_inputs("Simulator", state, control, None, values)
         if traced:
+            from . import _compiled
+
             return state_from(_compiled.rollout(self._number, inputs, values, 1, single=single), state)
         if self._check:
             self._check_unread(values["restitution"])
         call = self._make_call(1, single=single)
-        outputs = rollout(call, *inputs)  # type: ignore[arg-type]
+        outputs = rollout(call, *inputs)
         result = state_from(outputs, state)
         self._finish([call.info], result)
         return result
@@ -351,7 +339,7 @@ class Simulator(SceneIdentity, Measurements):
         traced = torch.compiler.is_compiling()
         if self._check and not traced:
             self._check_unread(values["restitution"])
-        now, driven, constant = inputs[:6], inputs[6:12], inputs[12:]
+        now, driven, constant = inputs[:STATE_COUNT], inputs[CONTROLS.start : CONTROLS.stop], inputs[CONTROLS.stop :]
         segments, infos, signatures = [], [], []
         with progress_bar(steps, progress and not traced) as advance:
             for start in range(0, steps, length):
@@ -368,10 +356,12 @@ class Simulator(SceneIdentity, Measurements):
                     part = tuple(None if t is None else t[start : start + count] for t in driven)
                 given = (*now, *part, *constant)
                 if traced:
+                    from . import _compiled
+
                     segment = _compiled.rollout(self._number, given, values, count, **settings)
                 else:
                     call = self._make_call(count, want_signature=want_signature, **settings)
-                    segment = rollout(call, *given)  # type: ignore[arg-type]
+                    segment = rollout(call, *given)
                     infos.append(call.info)
                     signatures.append(call.signature)
                 if start + count < steps:
@@ -405,7 +395,7 @@ class Simulator(SceneIdentity, Measurements):
         if self._check:
             self._check_unread(values["restitution"])
         call = self._make_call(1, single=single, want_contacts=True)
-        end = state_from(rollout(call, *inputs), state)  # type: ignore[arg-type]
+        end = state_from(rollout(call, *inputs), state)
         self._finish([call.info], end)
         assert call.contacts is not None  # they were asked for
         hard = self._settings["compliance"] == 0.0
@@ -427,7 +417,7 @@ class Simulator(SceneIdentity, Measurements):
         self, where: str, state: Any, controls: Any, steps: int | None, values: Mapping[str, Any] | None = None
     ) -> CheckedInputs:
         values = self._values(where, None) if values is None else values
-        parameters = {name: (values[name], self._parameter_shapes[name]) for name in (*PARAMETERS, *CLOTH_PARAMETERS)}
+        parameters = {name: (values[name], self._parameter_shapes[name]) for name in PARAMETERS}
         return checked_inputs(where, state, controls, parameters, steps, self._body_count, self._node_count)
 
     def _make_call(self, steps: int, **settings: Any) -> RolloutCall:
@@ -457,8 +447,7 @@ class Simulator(SceneIdentity, Measurements):
     def _finish_traced(self, info: Any, first_step: int, outputs: tuple[Tensor | None, ...]) -> None:
         """The same where compiled code runs, which does so after each segment."""
         before = self._info if first_step and isinstance(self._info, list) else []
-        names = ("position", "orientation", "velocity", "angular_velocity", "node_position", "node_velocity")
-        self._finish([*before, info], State(**dict(zip(names, outputs))))  # type: ignore[arg-type]
+        self._finish([*before, info], State(**dict(zip(STATE_FIELDS, outputs))))  # type: ignore[arg-type]
 
 
 def _checked_iterations(count: int | None, coupling: str) -> int | None:

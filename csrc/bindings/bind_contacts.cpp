@@ -5,6 +5,7 @@
 
 #include "bindings/bindings.hpp"
 #include "bindings/rollout_arrays.hpp"
+#include "rollout/inputs.hpp"
 #include "scene_queries.hpp"
 
 namespace diffsim::bindings {
@@ -137,26 +138,26 @@ py::tuple bound_min_distance(
     return py::make_tuple(nearest.distance, nearest.a, nearest.b);
 }
 
+constexpr std::size_t kParameterCount = count_of(InputKind::parameter);
+
 py::tuple bound_separate(
     const Model& model, const Options& options, const Array& position, const Array& orientation,
-    const Array& node_position, const Array& mass, const Array& inertia, const Array& cloth_density,
-    const Array& cloth_stretch, const Array& cloth_shear, const Array& cloth_bend, const Array& cloth_damping) {
-    const py::ssize_t n = model.body_count(), nodes = model.node_count(), cloths = model.cloth_count();
+    const Array& node_position, const std::array<Array, kParameterCount>& parameters) {
+    const py::ssize_t n = model.body_count(), nodes = model.node_count();
     const SceneState state = scene_state(model, position, orientation, node_position);
-    if (shape_of(mass) != Shape{n} || shape_of(inertia) != Shape{n, 3, 3})
-        throw std::invalid_argument("mass and inertia must have shapes (n_bodies,) and (n_bodies, 3, 3)");
-    for (const Array* array : {&cloth_density, &cloth_stretch, &cloth_shear, &cloth_bend, &cloth_damping})
-        if (shape_of(*array) != Shape{cloths})
-            throw std::invalid_argument("parameters of cloth must have shape (n_cloths,)");
-    Parameters parameters;
-    for (py::ssize_t i = 0; i < n; ++i) {
-        parameters.mass.push_back(mass.at(i));
-        parameters.inertia.emplace_back(Eigen::Map<const Mat3>(inertia.data(i, 0, 0)));
+    RolloutInputs inputs;
+    for (std::size_t i = 0; i < kParameterCount; ++i) {
+        const std::size_t k = kInputCount - kParameterCount + i;
+        const Core core = core_of(model, kInputs[k]);
+        const Shape expected(core.begin(), core.end());
+        if (shape_of(parameters[i]) != expected)
+            throw std::invalid_argument(
+                std::string(kInputs[k].label) + " must have shape " + shape_text(expected) + ", got " +
+                shape_text(shape_of(parameters[i])));
+        inputs[k].data = parameters[i].data();
     }
-    for (py::ssize_t i = 0; i < cloths; ++i)
-        parameters.cloths.push_back(
-            {cloth_density.at(i), cloth_stretch.at(i), cloth_shear.at(i), cloth_bend.at(i), cloth_damping.at(i)});
-    const SceneState moved = separate_state(model, options, parameters, state);
+    const Parameters values = read_parameters(model, inputs, 0);
+    const SceneState moved = separate_state(model, options, values, state);
     Array new_position(Shape{n, 3}), new_orientation(Shape{n, 4}), new_nodes(Shape{nodes, 3});
     double max_shift = 0.0;
     for (py::ssize_t i = 0; i < n; ++i) {
@@ -185,10 +186,7 @@ void bind_contacts(py::module_& module) {
 
     module.def(
         "separate", &bound_separate, py::arg("model"), py::arg("options"), py::arg("position").noconvert(),
-        py::arg("orientation").noconvert(), py::arg("node_position").noconvert(), py::kw_only(),
-        py::arg("mass").noconvert(), py::arg("inertia").noconvert(), py::arg("cloth_density").noconvert(),
-        py::arg("cloth_stretch").noconvert(), py::arg("cloth_shear").noconvert(), py::arg("cloth_bend").noconvert(),
-        py::arg("cloth_damping").noconvert(),
+        py::arg("orientation").noconvert(), py::arg("node_position").noconvert(), py::arg("parameters").noconvert(),
         "Move bodies and cloth apart to their rest distance: (position, orientation, node_position, largest shift "
         "[m]).");
 

@@ -27,15 +27,13 @@ Rollout bound_rollout(
     const Fields fields = input_fields(*model);
     const Leading leading = find_leading(inputs, fields, steps, controls_have_time);
     const RolloutInputs views = views_of(inputs, fields, leading);
-    Rollout result{py::tuple(kOutputCount), record ? std::make_shared<Tape>() : nullptr, {}, {}};
+    Rollout result{py::tuple(kStateCount), record ? std::make_shared<Tape>() : nullptr, {}, {}};
     TrajectoryArrays<double> trajectory;
-    const auto slots = members(trajectory);
-    for (std::size_t k = 0; k < kOutputCount; ++k) {
+    for (std::size_t k = 0; k < kStateCount; ++k) {
         result.trajectory[k] = py::none();
-        if (k >= 4 && model->cloths.empty()) continue;
-        const Core core = output_core(*model, k);
-        Array out(trajectory_shape(leading, keep_time, core));
-        *slots[k] = trajectory_view(out.mutable_data(), leading, keep_time, core);
+        if (kInputs[k].axis == Axis::nodes && model->cloths.empty()) continue;
+        Array out(trajectory_shape(leading, keep_time, fields[k].core));
+        trajectory[k] = trajectory_view(out.mutable_data(), leading, keep_time, fields[k].core);
         result.trajectory[k] = std::move(out);
     }
     const RolloutShape shape{
@@ -78,27 +76,24 @@ py::tuple bound_backward(
     const bool keep_time = tape->shape.keep_time;
 
     TrajectoryArrays<const double> upstream_views;
-    const auto upstream_slots = members(upstream_views);
-    for (std::size_t k = 0; k < kOutputCount; ++k) {
+    for (std::size_t k = 0; k < kStateCount; ++k) {
         if (!upstream[k]) continue;
-        const Core core = output_core(*tape->model, k);
-        const Shape expected = trajectory_shape(leading, keep_time, core);
+        const Shape expected = trajectory_shape(leading, keep_time, fields[k].core);
         if (shape_of(*upstream[k]) != expected)
             throw std::invalid_argument(
-                "the gradient of output " + std::to_string(k) + " must have shape " + shape_text(expected) + ", got " +
-                shape_text(shape_of(*upstream[k])));
-        *upstream_slots[k] = trajectory_view(upstream[k]->data(), leading, keep_time, core);
+                std::string("the gradient of ") + fields[k].name + " must have shape " + shape_text(expected) +
+                ", got " + shape_text(shape_of(*upstream[k])));
+        upstream_views[k] = trajectory_view(upstream[k]->data(), leading, keep_time, fields[k].core);
     }
 
     RolloutArrays<double> gradient;
-    const auto slots = members(gradient);
     py::tuple result(fields.size());
     for (std::size_t k = 0; k < fields.size(); ++k) {
         result[k] = py::none();
         if (!needs[k] || !inputs[k]) continue;
         Array out(shape_of(*inputs[k]));
         std::fill_n(out.mutable_data(), out.size(), 0.0);
-        *slots[k] = view_of(out.mutable_data(), fields[k], out.ndim(), leading);
+        gradient[k] = view_of(out.mutable_data(), fields[k], out.ndim(), leading);
         result[k] = std::move(out);
     }
     Signals().watch([&](Interrupt* interrupt) {
@@ -112,6 +107,34 @@ py::tuple bound_backward(
     if (!fault) return result;  // the caller's own: upstream is not finite
     if (fault->gradients.empty()) fault->gradients = std::move(faulty);
     raise_fault(*fault);
+}
+
+const char* name_of(InputKind kind) {
+    constexpr const char* kNames[] = {"state", "control", "parameter"};
+    return kNames[static_cast<int>(kind)];
+}
+
+const char* name_of(Axis axis) {
+    constexpr const char* kNames[] = {"", "bodies", "nodes", "objects", "cloths"};
+    return kNames[static_cast<int>(axis)];
+}
+
+const char* name_of(Allowed allowed) {
+    constexpr const char* kNames[] = {"any", "positive", "not_negative"};
+    return kNames[static_cast<int>(allowed)];
+}
+
+/// Without the state or the control that it is a field of.
+std::string name_of_field(const Input& input) {
+    const std::string label = input.label;
+    return label.substr(label.find('.') + 1);
+}
+
+py::tuple row_axes(const Input& input) {
+    const RowShape row = row_shape(input);
+    py::tuple result(row.rank);
+    for (int axis = 0; axis < row.rank; ++axis) result[axis] = row.axes[static_cast<std::size_t>(axis)];
+    return result;
 }
 
 /// Why a step did not converge, or nothing.
@@ -188,6 +211,19 @@ py::dict milliseconds(const RolloutInfo& info) {
 
 void bind_rollout(py::module_& module) {
     gradient_fault_type = py::exception<GradientFault>(module, "GradientFault", PyExc_RuntimeError).release().ptr();
+
+    py::class_<Input>(module, "Input", "A line of the table of inputs.")
+        .def_property_readonly("label", [](const Input& input) { return input.label; })
+        .def_property_readonly("name", &name_of_field)
+        .def_property_readonly("kind", [](const Input& input) { return name_of(kind_of(input)); })
+        .def_property_readonly("axis", [](const Input& input) { return name_of(input.axis); })
+        .def_property_readonly("row_shape", &row_axes)
+        .def_property_readonly("unit", [](const Input& input) { return input.unit; })
+        .def_property_readonly("allowed", [](const Input& input) { return name_of(input.allowed); });
+
+    module.def(
+        "inputs", [] { return std::vector<Input>(std::begin(kInputs), std::end(kInputs)); },
+        "What a rollout is given, in the order of its arguments.");
 
     py::class_<Tape, std::shared_ptr<Tape>>(module, "Tape", "What the backward of a rollout needs.")
         .def_property_readonly("nbytes", &Tape::bytes);

@@ -2,7 +2,6 @@
 
 #include <array>
 #include <functional>
-#include <initializer_list>
 #include <numeric>
 #include <optional>
 
@@ -13,22 +12,27 @@ namespace diffsim::bindings {
 
 using Shape = std::vector<py::ssize_t>;
 
-constexpr std::size_t kInputCount = 21, kOutputCount = 6;
-using InputArrays = std::array<OptionalArray, kInputCount>;    // in the order of RolloutArrays
-using OutputArrays = std::array<OptionalArray, kOutputCount>;  // in the order of TrajectoryArrays
+using InputArrays = std::array<OptionalArray, kInputCount>;   // in the order of the table
+using OutputArrays = std::array<OptionalArray, kStateCount>;  // of the state's part of it
 
 /// The axes of an array behind time and batch. Without a heap: a call makes some twenty of them.
 struct Core {
     std::array<py::ssize_t, 3> axes{};
     py::ssize_t rank = 0;
 
-    Core(std::initializer_list<py::ssize_t> list) : rank(static_cast<py::ssize_t>(list.size())) {
-        std::copy(list.begin(), list.end(), axes.begin());
-    }
+    void add(py::ssize_t axis) { axes[static_cast<std::size_t>(rank++)] = axis; }
     const py::ssize_t* begin() const { return axes.data(); }
     const py::ssize_t* end() const { return axes.data() + rank; }
     py::ssize_t size() const { return std::accumulate(begin(), end(), py::ssize_t{1}, std::multiplies<py::ssize_t>()); }
 };
+
+inline Core core_of(const Model& model, const Input& input) {
+    Core core;
+    if (input.axis != Axis::none) core.add(row_count(model, input.axis));
+    const RowShape row = row_shape(input);
+    for (int axis = 0; axis < row.rank; ++axis) core.add(row.axes[static_cast<std::size_t>(axis)]);
+    return core;
+}
 
 /// One input's name and core shape.
 struct Field {
@@ -39,61 +43,10 @@ struct Field {
 using Fields = std::array<Field, kInputCount>;
 
 inline Fields input_fields(const Model& model) {
-    const py::ssize_t n = model.body_count(), nodes = model.node_count(), cloths = model.cloth_count();
-    return {
-        {{"position", {n, 3}, false},
-         {"orientation", {n, 4}, false},
-         {"velocity", {n, 3}, false},
-         {"angular_velocity", {n, 3}, false},
-         {"node_position", {nodes, 3}, false},
-         {"node_velocity", {nodes, 3}, false},
-         {"force", {n, 3}, true},
-         {"torque", {n, 3}, true},
-         {"node_force", {nodes, 3}, true},
-         {"body_velocity", {n, 3}, true},
-         {"body_angular_velocity", {n, 3}, true},
-         {"node_drive", {nodes, 3}, true},
-         {"mass", {n}, false},
-         {"inertia", {n, 3, 3}, false},
-         {"gravity", {3}, false},
-         {"friction", {model.object_count()}, false},
-         {"cloth_density", {cloths}, false},
-         {"cloth_stretch", {cloths}, false},
-         {"cloth_shear", {cloths}, false},
-         {"cloth_bend", {cloths}, false},
-         {"cloth_damping", {cloths}, false}}};
-}
-
-template <typename T>
-std::array<BatchedView<T>*, kInputCount> members(RolloutArrays<T>& arrays) {
-    return {
-        &arrays.position,
-        &arrays.orientation,
-        &arrays.velocity,
-        &arrays.angular_velocity,
-        &arrays.node_position,
-        &arrays.node_velocity,
-        &arrays.force,
-        &arrays.torque,
-        &arrays.node_force,
-        &arrays.body_velocity,
-        &arrays.body_angular_velocity,
-        &arrays.node_drive,
-        &arrays.mass,
-        &arrays.inertia,
-        &arrays.gravity,
-        &arrays.friction,
-        &arrays.cloth_density,
-        &arrays.cloth_stretch,
-        &arrays.cloth_shear,
-        &arrays.cloth_bend,
-        &arrays.cloth_damping};
-}
-
-template <typename T>
-std::array<BatchedView<T>*, kOutputCount> members(TrajectoryArrays<T>& arrays) {
-    return {&arrays.position,         &arrays.orientation,   &arrays.velocity,
-            &arrays.angular_velocity, &arrays.node_position, &arrays.node_velocity};
+    Fields fields;
+    for (std::size_t k = 0; k < kInputCount; ++k)
+        fields[k] = {kInputs[k].label, core_of(model, kInputs[k]), kind_of(kInputs[k]) == InputKind::control};
+    return fields;
 }
 
 /// The leading axes of the inputs, found in a first pass over their shapes.
@@ -150,15 +103,9 @@ BatchedView<T> view_of(T* data, const Field& field, py::ssize_t ndim, const Lead
 
 inline RolloutInputs views_of(const InputArrays& arrays, const Fields& fields, const Leading& leading) {
     RolloutInputs inputs;
-    const auto slots = members(inputs);
     for (std::size_t k = 0; k < fields.size(); ++k)
-        if (arrays[k]) *slots[k] = view_of(arrays[k]->data(), fields[k], arrays[k]->ndim(), leading);
+        if (arrays[k]) inputs[k] = view_of(arrays[k]->data(), fields[k], arrays[k]->ndim(), leading);
     return inputs;
-}
-
-/// An output's core shape.
-inline Core output_core(const Model& model, std::size_t k) {
-    return {k < 4 ? model.body_count() : model.node_count(), k == 1 ? 4 : 3};
 }
 
 inline Shape trajectory_shape(const Leading& leading, bool keep_time, const Core& core) {

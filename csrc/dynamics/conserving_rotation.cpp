@@ -27,32 +27,24 @@ Mat3 conserving_jacobian(const ConservingSubstep& substep, double dt, const Mat3
     return substep.inertia - 0.5 * dt * (substep.turn.transpose() * skew(substep.momentum) * jacobian);
 }
 
-/// Newton's method from the guess, run until rounding stops it.
+/// I(R0) u = Exp(-dt (w0 + u) / 2) momentum from the guess u.
 ConservingSubstep solve_conserving_substep(
     const Mat3& R0, const Vec3& w0, const Vec3& guess, const Vec3& momentum, const Mat3& inertia_body, double dt) {
-    ConservingSubstep best;
-    double best_residual = kInfinity;
-    ConservingSubstep trial;
-    trial.R0 = R0;
-    trial.inertia = R0 * inertia_body * R0.transpose();
-    trial.momentum = momentum;
-    trial.u = guess;
-    // of the numbers subtracted
+    const Mat3 inertia = R0 * inertia_body * R0.transpose();
+    const auto evaluate = [&](const Vec3& u, ConservingSubstep& substep) -> Vec3 {
+        substep.R0 = R0;
+        substep.inertia = inertia;
+        substep.momentum = momentum;
+        substep.u = u;
+        substep.rotation = 0.5 * dt * (w0 + u);
+        substep.turn = exp_rotation(substep.rotation);
+        return inertia * u - substep.turn.transpose() * momentum;
+    };
+    const auto jacobian = [&](const ConservingSubstep& substep) -> Mat3 {
+        return conserving_jacobian(substep, dt, left_jacobian(substep.rotation));
+    };
     const double scale = std::max(momentum.norm(), inertia_body.norm() * std::max(w0.norm(), guess.norm()));
-    for (int k = 0; k < kMaxNewtonSteps; ++k) {
-        trial.rotation = 0.5 * dt * (w0 + trial.u);
-        trial.turn = exp_rotation(trial.rotation);
-        const Vec3 residual = trial.inertia * trial.u - trial.turn.transpose() * momentum;
-        const double norm = residual.norm();
-        if (!(norm < best_residual)) break;
-        best = trial;
-        best_residual = norm;
-        if (norm <= 0.5 * kEpsilon * momentum.norm()) break;
-        trial.u -= conserving_jacobian(trial, dt, left_jacobian(trial.rotation)).partialPivLu().solve(residual);
-    }
-    best.converged =
-        std::isfinite(best_residual) && best_residual <= 16.0 * kEpsilon * scale && best.rotation.norm() < 3.0;
-    return best;
+    return newton_substep<ConservingSubstep>(guess, momentum, scale, evaluate, jacobian);
 }
 
 /// The whole step in a given number of substeps; empty if one of them did not converge.
@@ -110,11 +102,7 @@ FreeRotationGradient conserving_rotation_backward(
     const double half = 0.5 * dt / static_cast<double>(substeps.size());
 
     Vec3 covector = Vec3::Zero();  // of the orientation at the end of the substep at hand
-    if (!single) {
-        // rotation = log(R1 R0ᵀ): a turn phi of R1 moves it by J⁻¹ phi, a turn of R0 by -J⁻¹ Exp phi.
-        covector = left_jacobian(result.rotation).transpose().partialPivLu().solve(grad_rotation);
-        grad.orientation -= exp_rotation(result.rotation).transpose() * covector;
-    }
+    if (!single) covector = log_rotation_backward(result.rotation, grad_rotation, grad.orientation);
     Vec3 grad_w = grad_angular_velocity;
     Vec3 grad_momentum = Vec3::Zero();  // of that at the start, and of what torque adds in the substep at hand
     for (std::size_t k = substeps.size(); k-- > 0;) {

@@ -14,7 +14,7 @@ namespace diffsim {
 namespace {
 
 struct Substep {
-    Vec3 angular_velocity;
+    Vec3 angular_velocity, rotation;
     Mat3 turn, R1;       ///< R1 = turn R0 at its end
     Mat3 inertia_world;  ///< at R1
     bool converged = false;
@@ -27,29 +27,27 @@ Mat3 momentum_jacobian(const Substep& substep, double dt, const Mat3& jacobian) 
     return inertia + dt * (inertia * skew(w) - skew(inertia * w)) * jacobian;
 }
 
-/// Newton's method on I(Exp(dt w) R0) w = momentum from the guess w, run until rounding stops it.
+Substep substep_at(const Mat3& R0, const Vec3& angular_velocity, const Mat3& inertia_body, double dt) {
+    Substep substep;
+    substep.angular_velocity = angular_velocity;
+    substep.rotation = dt * angular_velocity;
+    substep.turn = exp_rotation(substep.rotation);
+    substep.R1 = substep.turn * R0;
+    substep.inertia_world = substep.R1 * inertia_body * substep.R1.transpose();
+    return substep;
+}
+
+/// I(Exp(dt w) R0) w = momentum from the guess w.
 Substep solve_substep(const Mat3& R0, const Vec3& guess, const Vec3& momentum, const Mat3& inertia_body, double dt) {
-    Substep best;
-    double best_residual = kInfinity;
-    Vec3 w = guess;
-    const double scale = std::max(momentum.norm(), inertia_body.norm() * guess.norm());  // of the numbers subtracted
-    for (int k = 0; k < kMaxNewtonSteps; ++k) {
-        Substep trial;
-        trial.angular_velocity = w;
-        trial.turn = exp_rotation(dt * w);
-        trial.R1 = trial.turn * R0;
-        trial.inertia_world = trial.R1 * inertia_body * trial.R1.transpose();
-        const Vec3 residual = trial.inertia_world * w - momentum;
-        const double norm = residual.norm();
-        if (!(norm < best_residual)) break;
-        best = trial;
-        best_residual = norm;
-        if (norm <= 0.5 * kEpsilon * momentum.norm()) break;
-        w -= momentum_jacobian(trial, dt, left_jacobian(dt * w)).partialPivLu().solve(residual);
-    }
-    best.converged = std::isfinite(best_residual) && best_residual <= 16.0 * kEpsilon * scale &&
-                     dt * best.angular_velocity.norm() < 3.0;
-    return best;
+    const auto evaluate = [&](const Vec3& w, Substep& substep) -> Vec3 {
+        substep = substep_at(R0, w, inertia_body, dt);
+        return substep.inertia_world * w - momentum;
+    };
+    const auto jacobian = [&](const Substep& substep) -> Mat3 {
+        return momentum_jacobian(substep, dt, left_jacobian(substep.rotation));
+    };
+    const double scale = std::max(momentum.norm(), inertia_body.norm() * guess.norm());
+    return newton_substep<Substep>(guess, momentum, scale, evaluate, jacobian);
 }
 
 /// The whole step in a given number of substeps; empty if one of them did not converge.
@@ -113,10 +111,7 @@ FreeRotationGradient free_rotation_backward(
     Substep single;  // the one substep of most bodies needs no heap
     std::vector<Substep> several;
     if (result.substeps == 1) {
-        single.angular_velocity = result.angular_velocity;
-        single.turn = exp_rotation(dt * result.angular_velocity);
-        single.R1 = single.turn * R0;
-        single.inertia_world = single.R1 * inertia_body * single.R1.transpose();
+        single = substep_at(R0, result.angular_velocity, inertia_body, dt);
     } else {
         const Vec3 guess = initial_guess(inertia0, angular_velocity, torque, dt);
         several = solve_substeps(R0, guess, momentum, inertia_body, dt, result.substeps);
@@ -131,15 +126,13 @@ FreeRotationGradient free_rotation_backward(
     if (result.substeps == 1) {
         grad_w += dt * grad_rotation;
     } else {
-        // rotation = log(R1 R0ᵀ): a turn phi of R1 moves it by J⁻¹ phi, a turn of R0 by -J⁻¹ Exp phi.
-        covector = left_jacobian(result.rotation).transpose().partialPivLu().solve(grad_rotation);
-        grad.orientation -= exp_rotation(result.rotation).transpose() * covector;
+        covector = log_rotation_backward(result.rotation, grad_rotation, grad.orientation);
     }
     Vec3 grad_momentum = Vec3::Zero();
     for (std::size_t k = count; k-- > 0;) {
         const Substep& substep = substeps[k];
         const Vec3& w = substep.angular_velocity;
-        const Mat3 jacobian = left_jacobian(dt_sub * w);
+        const Mat3 jacobian = left_jacobian(substep.rotation);
         grad_w += dt_sub * jacobian.transpose() * covector;
         const Vec3 multiplier = momentum_jacobian(substep, dt_sub, jacobian).transpose().partialPivLu().solve(grad_w);
         grad_momentum += multiplier;

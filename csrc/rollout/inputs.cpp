@@ -1,9 +1,11 @@
 #include "rollout/inputs.hpp"
 
 #include <Eigen/Cholesky>
+#include <algorithm>
 #include <cmath>
 #include <sstream>
 
+#include "model/number_text.hpp"
 #include "scene_queries.hpp"
 
 namespace diffsim {
@@ -23,67 +25,62 @@ std::string text_of(const Matrix& value) {
     return text.str();
 }
 
-[[noreturn]] void refuse(const std::string& field, const Model& model, int body, const std::string& problem) {
-    throw std::invalid_argument(
-        field + " of body '" + model.name(body) + "' (index " + std::to_string(body) + ") " + problem);
+/// Whose entry of an input it is, as in " of body 'cube' (index 0)".
+std::string owner_text(const Model& model, Axis axis, int index) {
+    const std::string with_index = "' (index " + std::to_string(index) + ")";
+    switch (axis) {
+        case Axis::bodies:
+            return " of body '" + model.name(index) + with_index;
+        case Axis::cloths:
+            return " of cloth '" + model.cloths[index].name + with_index;
+        case Axis::objects:
+            return " of '" + (index == model.body_count() + model.cloth_count() ? "ground" : model.name(index)) +
+                   with_index;
+        case Axis::nodes: {
+            std::size_t cloth = 0;
+            while (index >= model.cloths[cloth].first_node + model.cloths[cloth].node_count()) ++cloth;
+            return " of node " + std::to_string(index - model.cloths[cloth].first_node) + " of cloth '" +
+                   model.cloths[cloth].name + with_index;
+        }
+        case Axis::none:
+            break;
+    }
+    return "";
 }
 
-template <typename Vector>
-void require_finite(const char* field, const Model& model, int body, const Vector& value) {
-    if (!value.allFinite()) refuse(field, model, body, "must be finite, got (" + text_of(value) + ")");
+[[noreturn]] void refuse(const Model& model, const Input& input, int index, const std::string& problem) {
+    throw std::invalid_argument(input.label + owner_text(model, input.axis, index) + " " + problem);
 }
 
-[[noreturn]] void refuse_node(
-    const std::string& field, const Model& model, int node, const std::string& problem, const Vec3& value,
-    const std::string& mend = "") {
-    std::size_t cloth = 0;
-    while (node >= model.cloths[cloth].first_node + model.cloths[cloth].node_count()) ++cloth;
-    throw std::invalid_argument(
-        field + " of node " + std::to_string(node - model.cloths[cloth].first_node) + " of cloth '" +
-        model.cloths[cloth].name + "' (index " + std::to_string(node) + ") " + problem + ", got (" + text_of(value) +
-        ")" + mend);
+/// "1 0 0" or, of parameters, whose units are part of what is said, "2 kg".
+std::string with_unit(const Input& input, const std::string& value) {
+    const bool told = kind_of(input) == InputKind::parameter && *input.unit != '\0';
+    return told ? value + " " + input.unit : value;
+}
+
+template <typename Matrix>
+void require_finite(const Model& model, const Input& input, int index, const Matrix& value) {
+    if (!value.allFinite())
+        refuse(model, input, index, "must be finite, got " + with_unit(input, "(" + text_of(value) + ")"));
+}
+
+void require_in_range(const Model& model, const Input& input, int index, double value) {
+    const bool may_be_zero = input.allowed == Allowed::not_negative, any = input.allowed == Allowed::any;
+    if (std::isfinite(value) && (any || value > 0.0 || (may_be_zero && value == 0.0))) return;
+    const std::string sign = any ? "" : may_be_zero ? "zero or positive and " : "positive and ";
+    refuse(model, input, index, "must be " + sign + "finite, got " + with_unit(input, number_text(value)));
 }
 
 /// One row per node; zeros where nothing is given.
 void read_nodes(
-    const char* field, const Model& model, const BatchedView<const double>& view, int time, int scene,
+    const Model& model, const Input& input, const BatchedView<const double>& view, int time, int scene,
     std::vector<Vec3>& nodes) {
     nodes.assign(static_cast<std::size_t>(model.node_count()), Vec3::Zero());
     if (!view.present()) return;
     for (int i = 0; i < model.node_count(); ++i) {
         nodes[i] = row<3>(view.at(time, scene), i);
-        if (!nodes[i].allFinite()) refuse_node(field, model, i, "must be finite", nodes[i]);
+        require_finite(model, input, i, nodes[i]);
     }
-}
-
-double read_cloth_parameter(
-    const char* field, const char* unit, bool may_be_zero, const Model& model, const BatchedView<const double>& view,
-    int cloth, int scene) {
-    const double value = view.at(0, scene)[cloth];
-    if (std::isfinite(value) && (value > 0.0 || (may_be_zero && value == 0.0))) return value;
-    std::ostringstream text;
-    text << field << " of cloth '" << model.cloths[cloth].name << "' (index " << cloth << ") must be "
-         << (may_be_zero ? "zero or positive" : "positive") << " and finite, got " << value << " " << unit;
-    throw std::invalid_argument(text.str());
-}
-
-/// Left empty where there is none, so that nothing asks for it.
-void read_friction(const Model& model, const RolloutInputs& in, int scene, Parameters& parameters) {
-    const int count = model.object_count();
-    if (count == 0) return;
-    const double* values = in.friction.at(0, scene);
-    bool any = false;
-    for (int i = 0; i < count; ++i) {
-        if (!(values[i] >= 0.0) || !std::isfinite(values[i])) {
-            const bool is_ground = i == model.body_count() + model.cloth_count();
-            std::ostringstream text;
-            text << "friction of '" << (is_ground ? "ground" : model.name(i)) << "' (index " << i
-                 << ") must be zero or positive and finite, got " << values[i];
-            throw std::invalid_argument(text.str());
-        }
-        any = any || values[i] > 0.0;
-    }
-    if (any) parameters.friction.assign(values, values + count);
 }
 
 }  // namespace
@@ -91,27 +88,30 @@ void read_friction(const Model& model, const RolloutInputs& in, int scene, Param
 SceneState read_state(const Model& model, const RolloutInputs& in, int scene) {
     SceneState state;
     state.bodies.resize(model.bodies.size());
-    for (int i = 0; i < model.body_count(); ++i) {
-        BodyState& body = state.bodies[i];
-        body.position = row<3>(in.position.at(0, scene), i);
-        body.orientation = row<4>(in.orientation.at(0, scene), i);
-        body.velocity = row<3>(in.velocity.at(0, scene), i);
-        body.angular_velocity = row<3>(in.angular_velocity.at(0, scene), i);
-        require_finite("state.position", model, i, body.position);
-        require_finite("state.orientation", model, i, body.orientation);
-        require_finite("state.velocity", model, i, body.velocity);
-        require_finite("state.angular_velocity", model, i, body.angular_velocity);
-        const double norm = body.orientation.norm();
-        if (!(std::abs(norm - 1.0) <= kUnitTolerance))
-            refuse(
-                "state.orientation", model, i,
-                "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) + "; divide it by its norm");
-        if (std::abs(norm - 1.0) > 4.0 * kEpsilon) body.orientation /= norm;  // bits of our own states stay
-    }
-    if (!model.cloths.empty()) {
-        read_nodes("state.node_position", model, in.node_position, 0, scene, state.node_position);
-        read_nodes("state.node_velocity", model, in.node_velocity, 0, scene, state.node_velocity);
-    }
+    const auto read_vectors = [&](std::size_t k, Vec3 BodyState::* member) {
+        for (int i = 0; i < model.body_count(); ++i) {
+            state.bodies[i].*member = row<3>(in[k].at(0, scene), i);
+            require_finite(model, kInputs[k], i, state.bodies[i].*member);
+        }
+    };
+    const auto read_quaternions = [&](std::size_t k, Vec4 BodyState::* member) {
+        for (int i = 0; i < model.body_count(); ++i) {
+            Vec4& q = state.bodies[i].*member;
+            q = row<4>(in[k].at(0, scene), i);
+            require_finite(model, kInputs[k], i, q);
+            const double norm = q.norm();
+            if (!(std::abs(norm - 1.0) <= kUnitTolerance))
+                refuse(
+                    model, kInputs[k], i,
+                    "must be a unit quaternion (w, x, y, z), got norm " + std::to_string(norm) +
+                        "; divide it by its norm");
+            if (std::abs(norm - 1.0) > 4.0 * kEpsilon) q /= norm;  // bits of our own states stay
+        }
+    };
+    for_each_input<InputKind::state>(
+        read_vectors, read_quaternions, [&](std::size_t k, std::vector<Vec3> SceneState::* member) {
+            if (!model.cloths.empty()) read_nodes(model, kInputs[k], in[k], 0, scene, state.*member);
+        });
     return state;
 }
 
@@ -130,82 +130,108 @@ void refuse_crossing(const Model& model, const SceneState& state) {
 
 Parameters read_parameters(const Model& model, const RolloutInputs& in, int scene) {
     Parameters parameters;
-    parameters.gravity = row<3>(in.gravity.at(0, scene), 0);
-    if (!parameters.gravity.allFinite())
-        throw std::invalid_argument("gravity must be finite, got (" + text_of(parameters.gravity) + ") m/s²");
-    parameters.mass.resize(model.bodies.size());
-    parameters.inertia.resize(model.bodies.size());
-    for (int i = 0; i < model.body_count(); ++i) {
-        const double* inertia = in.inertia.at(0, scene) + 9 * i;
-        const Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>> given(inertia);
-        parameters.mass[i] = in.mass.at(0, scene)[i];
-        parameters.inertia[i] = 0.5 * (given + given.transpose());
-        if (!model.bodies[i].is_dynamic()) continue;
-        if (!(parameters.mass[i] > 0.0) || !std::isfinite(parameters.mass[i]))
-            refuse("mass", model, i, "must be positive and finite, got " + std::to_string(parameters.mass[i]) + " kg");
-        if (!parameters.inertia[i].allFinite() || parameters.inertia[i].llt().info() != Eigen::Success)
-            refuse("inertia", model, i, "must be positive definite, got (" + text_of(given) + ") kg·m²");
-    }
-    read_friction(model, in, scene, parameters);
-    for (int i = 0; i < model.cloth_count(); ++i) {
-        ClothParameters cloth;
-        cloth.density = read_cloth_parameter("cloth_density", "kg/m²", false, model, in.cloth_density, i, scene);
-        cloth.stretch = read_cloth_parameter("cloth_stretch", "N/m", false, model, in.cloth_stretch, i, scene);
-        cloth.shear = read_cloth_parameter("cloth_shear", "N/m", false, model, in.cloth_shear, i, scene);
-        cloth.bend = read_cloth_parameter("cloth_bend", "N·m", false, model, in.cloth_bend, i, scene);
-        cloth.damping = read_cloth_parameter("cloth_damping", "s", true, model, in.cloth_damping, i, scene);
-        parameters.cloths.push_back(cloth);
-    }
+    parameters.cloths.resize(model.cloths.size());
+    const auto is_read = [&](const Input& input, int i) {
+        return input.axis != Axis::bodies || model.bodies[i].is_dynamic();
+    };
+    const auto read_vector = [&](std::size_t k, Vec3 Parameters::* member) {
+        parameters.*member = row<3>(in[k].at(0, scene), 0);
+        require_finite(model, kInputs[k], 0, parameters.*member);
+    };
+    const auto read_numbers = [&](std::size_t k, std::vector<double> Parameters::* member) {
+        const double* values = in[k].at(0, scene);
+        const int count = row_count(model, kInputs[k].axis);
+        for (int i = 0; i < count; ++i)
+            if (is_read(kInputs[k], i)) require_in_range(model, kInputs[k], i, values[i]);
+        // Of objects left empty where there is none, so that nothing asks for it.
+        const bool left_out = kInputs[k].axis == Axis::objects &&
+                              std::all_of(values, values + count, [](double value) { return value == 0.0; });
+        if (!left_out) (parameters.*member).assign(values, values + count);
+    };
+    const auto read_matrices = [&](std::size_t k, std::vector<Mat3> Parameters::* member) {
+        for (int i = 0; i < row_count(model, kInputs[k].axis); ++i) {
+            const Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>> given(in[k].at(0, scene) + 9 * i);
+            const Mat3 symmetric = 0.5 * (given + given.transpose());
+            if (is_read(kInputs[k], i) && (!symmetric.allFinite() || symmetric.llt().info() != Eigen::Success))
+                refuse(
+                    model, kInputs[k], i,
+                    "must be positive definite, got " + with_unit(kInputs[k], "(" + text_of(given) + ")"));
+            (parameters.*member).push_back(symmetric);
+        }
+    };
+    const auto read_of_cloths = [&](std::size_t k, double ClothParameters::* member) {
+        for (int i = 0; i < model.cloth_count(); ++i) {
+            const double value = in[k].at(0, scene)[i];
+            require_in_range(model, kInputs[k], i, value);
+            parameters.cloths[i].*member = value;
+        }
+    };
+    for_each_input<InputKind::parameter>(read_vector, read_numbers, read_matrices, read_of_cloths);
     return parameters;
 }
+
+namespace {
 
 constexpr const char* kKindNames[] = {"dynamic", "static", "kinematic"};
 constexpr const char* kPushMend = "only a body of kind='dynamic' can be pushed";
 constexpr const char* kDriveMend =
     "only a body of kind='kinematic' can be driven; the velocity of any other is given to the state";
 
+/// A value that nothing would read is a mistake; zeros are what is given for bodies and nodes that are not meant.
+void refuse_unread(const Model& model, const Input& input, int body, const Vec3& value) {
+    refuse(
+        model, input, body,
+        "must be zero, because the body is " + std::string(kKindNames[static_cast<int>(model.bodies[body].kind)]) +
+            ", got (" + text_of(value) + "); " +
+            (drives(std::get<Vec3 BodyControl::*>(input.place)) ? kDriveMend : kPushMend));
+}
+
+void refuse_drives_of_free_nodes(const Model& model, const Input& input, const std::vector<Vec3>& velocity) {
+    for (const Cloth& cloth : model.cloths)
+        for (int i = 0; i < cloth.node_count(); ++i) {
+            const Vec3& value = velocity[cloth.first_node + i];
+            if (!cloth.pinned[i] && !value.isZero(0.0))
+                refuse(
+                    model, input, cloth.first_node + i,
+                    "must be zero, because the node is not pinned, got (" + text_of(value) +
+                        "); pin it (add_cloth: pinned=), or give its velocity to the state");
+        }
+}
+
+}  // namespace
+
 void read_control(
     const Model& model, const RolloutInputs& in, int time, int scene, const SceneState& state, Workers& workers,
     SceneControl& control) {
     control.bodies.resize(model.bodies.size());
-    // A value that nothing would read is a mistake; zeros are what is given for bodies that are not meant.
-    const auto read = [&](const char* field, const BatchedView<const double>& view, int body, const Vec3& otherwise,
-                          bool is_read, const char* mend) {
-        if (!view.present()) return otherwise;
-        const Vec3 value = row<3>(view.at(time, scene), body);
-        require_finite(field, model, body, value);
-        if (!is_read && !value.isZero(0.0))
-            refuse(
-                field, model, body,
-                "must be zero, because the body is " +
-                    std::string(kKindNames[static_cast<int>(model.bodies[body].kind)]) + ", got (" + text_of(value) +
-                    "); " + mend);
-        return value;
-    };
-    const Vec3 zero = Vec3::Zero();
-    workers.for_each_range(model.body_count(), kBodiesARange, [&](int begin, int end, int) {
+    const auto read_range = [&](std::size_t k, Vec3 BodyControl::* member, int begin, int end) {
+        const Vec3 BodyState::* otherwise = velocity_driven_by(member);
+        const BodyKind read_of = drives(member) ? BodyKind::kinematic : BodyKind::dynamic;
         for (int i = begin; i < end; ++i) {
-            const bool pushed = model.bodies[i].is_dynamic(), driven = model.bodies[i].kind == BodyKind::kinematic;
-            const BodyState& now = state.bodies[i];
-            BodyControl& body = control.bodies[i];
-            body.force = read("control.force", in.force, i, zero, pushed, kPushMend);
-            body.torque = read("control.torque", in.torque, i, zero, pushed, kPushMend);
-            body.velocity = read("control.body_velocity", in.body_velocity, i, now.velocity, driven, kDriveMend);
-            body.angular_velocity = read(
-                "control.body_angular_velocity", in.body_angular_velocity, i, now.angular_velocity, driven, kDriveMend);
+            Vec3& value = control.bodies[i].*member;
+            if (in[k].present()) {
+                value = row<3>(in[k].at(time, scene), i);
+                require_finite(model, kInputs[k], i, value);
+                if (model.bodies[i].kind != read_of && !value.isZero(0.0)) refuse_unread(model, kInputs[k], i, value);
+            } else if (otherwise != nullptr) {
+                value = state.bodies[i].*otherwise;
+            } else {
+                value.setZero();
+            }
         }
+    };
+    workers.for_each_range(model.body_count(), kBodiesARange, [&](int begin, int end, int) {
+        for_each_input<InputKind::control>(
+            [&](std::size_t k, Vec3 BodyControl::* member) { read_range(k, member, begin, end); },
+            [](std::size_t, std::vector<Vec3> SceneControl::*) {});
     });
     if (model.cloths.empty()) return;
-    read_nodes("control.node_force", model, in.node_force, time, scene, control.node_force);
-    read_nodes("control.node_velocity", model, in.node_drive, time, scene, control.node_velocity);
-    if (!in.node_drive.present()) return;
-    for (const Cloth& cloth : model.cloths)
-        for (int i = 0; i < cloth.node_count(); ++i)
-            if (!cloth.pinned[i] && !control.node_velocity[cloth.first_node + i].isZero(0.0))
-                refuse_node(
-                    "control.node_velocity", model, cloth.first_node + i,
-                    "must be zero, because the node is not pinned", control.node_velocity[cloth.first_node + i],
-                    "; pin it (add_cloth: pinned=), or give its velocity to the state");
+    for_each_input<InputKind::control>(
+        [](std::size_t, Vec3 BodyControl::*) {},
+        [&](std::size_t k, std::vector<Vec3> SceneControl::* member) {
+            read_nodes(model, kInputs[k], in[k], time, scene, control.*member);
+            if (drives(member) && in[k].present()) refuse_drives_of_free_nodes(model, kInputs[k], control.*member);
+        });
 }
 
 }  // namespace diffsim

@@ -30,6 +30,17 @@ void located(bool several, const char* name, int index, const Work& work) {
     }
 }
 
+/// Of a kinematic body, the velocity that a control takes the place of; null for controls that push dynamic bodies.
+inline Vec3 BodyState::* velocity_driven_by(Vec3 BodyControl::* member) {
+    if (member == &BodyControl::velocity) return &BodyState::velocity;
+    if (member == &BodyControl::angular_velocity) return &BodyState::angular_velocity;
+    return nullptr;
+}
+
+/// Whether a control moves kinematic bodies, or pinned nodes, and does not push what moves freely.
+inline bool drives(Vec3 BodyControl::* member) { return velocity_driven_by(member) != nullptr; }
+inline bool drives(std::vector<Vec3> SceneControl::* member) { return member == &SceneControl::node_velocity; }
+
 SceneState read_state(const Model& model, const RolloutInputs& in, int scene);
 
 /// Steps keep what is apart apart; what crosses to begin with they would keep crossed.

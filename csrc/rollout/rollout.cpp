@@ -11,17 +11,18 @@ namespace {
 
 void write_state(const SceneState& state, const TrajectoryArrays<double>& out, int time, int scene, Workers& workers) {
     workers.for_each_range(static_cast<int>(state.bodies.size()), kBodiesARange, [&](int begin, int end, int) {
-        for (int i = begin; i < end; ++i) {
-            row<3>(out.position.at(time, scene), i) = state.bodies[i].position;
-            row<4>(out.orientation.at(time, scene), i) = state.bodies[i].orientation;
-            row<3>(out.velocity.at(time, scene), i) = state.bodies[i].velocity;
-            row<3>(out.angular_velocity.at(time, scene), i) = state.bodies[i].angular_velocity;
-        }
+        const auto write = [&](std::size_t k, auto BodyState::* member) {
+            constexpr int size = std::decay_t<decltype(state.bodies[0].*member)>::RowsAtCompileTime;
+            double* const rows = out[k].at(time, scene);
+            for (int i = begin; i < end; ++i) row<size>(rows, i) = state.bodies[i].*member;
+        };
+        for_each_input<InputKind::state>(write, [](std::size_t, std::vector<Vec3> SceneState::*) {});
     });
-    for (int i = 0; i < static_cast<int>(state.node_position.size()); ++i) {
-        row<3>(out.node_position.at(time, scene), i) = state.node_position[i];
-        row<3>(out.node_velocity.at(time, scene), i) = state.node_velocity[i];
-    }
+    const auto write_nodes = [&](std::size_t k, std::vector<Vec3> SceneState::* member) {
+        for (int i = 0; i < static_cast<int>(state.node_position.size()); ++i)
+            row<3>(out[k].at(time, scene), i) = (state.*member)[i];
+    };
+    for_each_input<InputKind::state>(write_nodes, [](std::size_t, auto BodyState::*) {});
 }
 
 void merge_info(StepInfo& total, const StepInfo& scene) {

@@ -4,6 +4,7 @@
 #include <optional>
 #include <string>
 
+#include "rollout/input_table.hpp"
 #include "step/contact_readout.hpp"
 #include "step/step.hpp"
 
@@ -20,24 +21,15 @@ struct BatchedView {
     T* at(int time, int scene) const { return data + time * time_stride + scene * batch_stride; }
 };
 
-/// The inputs of a rollout, or gradients of the same shapes.
+/// The inputs of a rollout, or gradients of the same shapes, in the order of the table. All of cloth is absent in scenes
+/// without.
 template <typename T>
-struct RolloutArrays {
-    // State: n x 3, n x 4, n x 3, n x 3; k x 3, k x 3 with k cloth nodes. All of cloth is absent in scenes without.
-    BatchedView<T> position, orientation, velocity, angular_velocity, node_position, node_velocity;
-    // Controls: n x 3, n x 3, k x 3; n x 3, n x 3, k x 3. The drive is the velocity of pinned nodes.
-    BatchedView<T> force, torque, node_force, body_velocity, body_angular_velocity, node_drive;
-    // Parameters: n, n x 3 x 3, 3; one per object; one per cloth.
-    BatchedView<T> mass, inertia, gravity, friction;
-    BatchedView<T> cloth_density, cloth_stretch, cloth_shear, cloth_bend, cloth_damping;
-};
+using RolloutArrays = std::array<BatchedView<T>, kInputCount>;
 using RolloutInputs = RolloutArrays<const double>;
 
-/// A trajectory, or the gradient with respect to one.
+/// A trajectory, or the gradient with respect to one: the state's part of the table.
 template <typename T>
-struct TrajectoryArrays {
-    BatchedView<T> position, orientation, velocity, angular_velocity, node_position, node_velocity;
-};
+using TrajectoryArrays = std::array<BatchedView<T>, kStateCount>;
 
 struct RolloutShape {
     int steps = 1;

@@ -16,26 +16,49 @@ struct SceneGradient {
     ParameterGradient parameters;
 };
 
+/// Where a body's part of the state's gradient is kept.
+struct BodyStateSlot {
+    std::size_t input;
+    Vec3 BodyStateGradient::* gradient;
+};
+inline constexpr std::size_t kOrientation = input_index("state.orientation");  // a covector, see BodyStateGradient
+inline constexpr BodyStateSlot kBodyStateSlots[] = {
+    {input_index("state.position"), &BodyStateGradient::position},
+    {kOrientation, &BodyStateGradient::orientation},
+    {input_index("state.velocity"), &BodyStateGradient::velocity},
+    {input_index("state.angular_velocity"), &BodyStateGradient::angular_velocity},
+};
+/// The same of nodes.
+struct NodeStateSlot {
+    std::size_t input;
+    std::vector<Vec3> SceneStateGradient::* gradient;
+};
+inline constexpr NodeStateSlot kNodeStateSlots[] = {
+    {input_index("state.node_position"), &SceneStateGradient::node_position},
+    {input_index("state.node_velocity"), &SceneStateGradient::node_velocity},
+};
+static_assert(std::size(kBodyStateSlots) + std::size(kNodeStateSlots) == kStateCount);
+
 void add_upstream(
     const TrajectoryArrays<const double>& upstream, int time, int scene, const SceneState& state, Workers& workers,
     SceneStateGradient& gradient) {
     workers.for_each_range(static_cast<int>(gradient.bodies.size()), kBodiesARange, [&](int begin, int end, int) {
-        for (int i = begin; i < end; ++i) {
-            BodyStateGradient& g = gradient.bodies[i];
-            if (upstream.position.present()) g.position += row<3>(upstream.position.at(time, scene), i);
-            if (upstream.velocity.present()) g.velocity += row<3>(upstream.velocity.at(time, scene), i);
-            if (upstream.angular_velocity.present())
-                g.angular_velocity += row<3>(upstream.angular_velocity.at(time, scene), i);
-            if (upstream.orientation.present())
-                g.orientation += quaternion_gradient_to_covector(
-                    state.bodies[i].orientation, row<4>(upstream.orientation.at(time, scene), i));
+        for (const BodyStateSlot& slot : kBodyStateSlots) {
+            if (!upstream[slot.input].present()) continue;
+            const double* const rows = upstream[slot.input].at(time, scene);
+            for (int i = begin; i < end; ++i) {
+                Vec3& g = gradient.bodies[i].*slot.gradient;
+                if (slot.input == kOrientation)
+                    g += quaternion_gradient_to_covector(state.bodies[i].orientation, row<4>(rows, i));
+                else
+                    g += row<3>(rows, i);
+            }
         }
     });
-    for (int i = 0; i < static_cast<int>(gradient.node_position.size()); ++i) {
-        if (upstream.node_position.present())
-            gradient.node_position[i] += row<3>(upstream.node_position.at(time, scene), i);
-        if (upstream.node_velocity.present())
-            gradient.node_velocity[i] += row<3>(upstream.node_velocity.at(time, scene), i);
+    for (const NodeStateSlot& slot : kNodeStateSlots) {
+        std::vector<Vec3>& g = gradient.*slot.gradient;
+        for (int i = 0; upstream[slot.input].present() && i < static_cast<int>(g.size()); ++i)
+            g[i] += row<3>(upstream[slot.input].at(time, scene), i);
     }
 }
 
@@ -51,15 +74,38 @@ SceneState end_state(const StepRecord& record) {
 
 /// What the backward of a rollout's step has to compute: earlier steps need the state's gradient whether asked for or not.
 GradientNeeds step_needs(const RolloutArrays<double>& wanted, int time) {
-    const auto any = [](const auto&... views) { return (views.present() || ...); };
-    GradientNeeds needs;
-    needs.place = time > 0 || any(wanted.position, wanted.orientation, wanted.velocity, wanted.angular_velocity,
-                                  wanted.node_position, wanted.node_velocity, wanted.body_velocity,
-                                  wanted.body_angular_velocity, wanted.node_drive);
-    needs.mass = any(wanted.mass, wanted.cloth_density);
-    needs.inertia = any(wanted.inertia);
-    needs.material = any(wanted.cloth_stretch, wanted.cloth_shear, wanted.cloth_bend, wanted.cloth_damping);
+    GradientNeeds needs{time > 0, false, false, false};
+    for (std::size_t k = 0; k < kInputCount; ++k)
+        if (wanted[k].present() && kInputs[k].need != nullptr) needs.*kInputs[k].need = true;
     return needs;
+}
+
+/// Of all parameters, zero.
+ParameterGradient zero_gradient(const Parameters& parameters) {
+    ParameterGradient zero;
+    zero.cloths.resize(parameters.cloths.size());
+    for_each_input<InputKind::parameter>(
+        [&](std::size_t, Vec3 Parameters::* member) { (zero.*member).setZero(); },
+        [&](std::size_t, std::vector<double> Parameters::* member) {
+            (zero.*member).assign((parameters.*member).size(), 0.0);
+        },
+        [&](std::size_t, std::vector<Mat3> Parameters::* member) {
+            (zero.*member).assign((parameters.*member).size(), Mat3::Zero());
+        },
+        [](std::size_t, double ClothParameters::*) {});
+    return zero;
+}
+
+/// Where a kinematic body is not driven, its own velocity drives it.
+void add_gradient_of_undriven(
+    const Model& model, const RolloutInputs& inputs, const SceneControlGradient& control, SceneStateGradient& state) {
+    constexpr std::size_t kVelocity = input_index("control.body_velocity");
+    constexpr std::size_t kAngularVelocity = input_index("control.body_angular_velocity");
+    for (std::size_t i = 0; i < model.bodies.size(); ++i) {
+        if (model.bodies[i].kind != BodyKind::kinematic) continue;
+        if (!inputs[kVelocity].present()) state.bodies[i].velocity += control.bodies[i].velocity;
+        if (!inputs[kAngularVelocity].present()) state.bodies[i].angular_velocity += control.bodies[i].angular_velocity;
+    }
 }
 
 /// Calls after_step(time, gradient so far, gradient of the step's control), which says whether to go on.
@@ -76,10 +122,7 @@ SceneGradient scene_backward(
     gradient.state.node_position.assign(node_count, Vec3::Zero());
     gradient.state.node_velocity.assign(node_count, Vec3::Zero());
     if (keep_controls) gradient.control.resize(static_cast<std::size_t>(tape.shape.steps));
-    gradient.parameters.mass.assign(count, 0.0);
-    gradient.parameters.inertia.assign(count, Mat3::Zero());
-    gradient.parameters.cloths.assign(model.cloths.size(), ClothParameters{});
-    gradient.parameters.friction.assign(parameters.friction.size(), 0.0);
+    gradient.parameters = zero_gradient(parameters);
     SceneControl control;
     SceneControlGradient scratch;
     const std::vector<StepRecord>& records = tape.records[scene];
@@ -100,84 +143,77 @@ SceneGradient scene_backward(
         step_backward(
             model, tape.options, parameters, control, record, step_needs(wanted, time), workspace, gradient.state,
             control_gradient, gradient.parameters);
-        // Where a kinematic body was not driven, its own velocity drove it.
-        for (std::size_t i = 0; i < count; ++i) {
-            if (model.bodies[i].kind != BodyKind::kinematic) continue;
-            if (!inputs.body_velocity.present())
-                gradient.state.bodies[i].velocity += control_gradient.bodies[i].velocity;
-            if (!inputs.body_angular_velocity.present())
-                gradient.state.bodies[i].angular_velocity += control_gradient.bodies[i].angular_velocity;
-        }
+        add_gradient_of_undriven(model, inputs, control_gradient, gradient.state);
         if (!after_step(time, gradient, control_gradient)) break;
     }
     return gradient;
 }
 
-void write_cloth_gradient(
-    const Model& model, const RolloutArrays<double>& out, int scene, const SceneGradient& gradient) {
-    const auto add3 = [](const BatchedView<double>& view, int time, int batch, int node, const Vec3& value) {
-        if (view.present()) row<3>(view.at(time, batch), node) += value;
-    };
-    const auto add = [&](const BatchedView<double>& view, int cloth, double value) {
-        if (view.present()) view.at(0, scene)[cloth] += value;
-    };
-    for (int k = 0; k < model.cloth_count(); ++k) {
-        const ClothParameters& parameters = gradient.parameters.cloths[k];
-        add(out.cloth_density, k, parameters.density);
-        add(out.cloth_stretch, k, parameters.stretch);
-        add(out.cloth_shear, k, parameters.shear);
-        add(out.cloth_bend, k, parameters.bend);
-        add(out.cloth_damping, k, parameters.damping);
-        const Cloth& cloth = model.cloths[k];
-        for (int local = 0; local < cloth.node_count(); ++local) {
-            const int node = cloth.first_node + local;
-            add3(out.node_position, 0, scene, node, gradient.state.node_position[node]);
-            add3(out.node_velocity, 0, scene, node, gradient.state.node_velocity[node]);
-            for (int time = 0; time < static_cast<int>(gradient.control.size()); ++time) {
-                const SceneControlGradient& control = gradient.control[time];
-                if (cloth.pinned[local])
-                    add3(out.node_drive, time, scene, node, control.node_velocity[node]);
-                else
-                    add3(out.node_force, time, scene, node, control.node_force[node]);
+void write_state_gradient(
+    const Model& model, const RolloutInputs& inputs, const RolloutArrays<double>& out, int scene,
+    const SceneStateGradient& gradient) {
+    for (const BodyStateSlot& slot : kBodyStateSlots) {
+        if (!out[slot.input].present()) continue;
+        double* const rows = out[slot.input].at(0, scene);
+        for (int i = 0; i < model.body_count(); ++i) {
+            const Vec3& g = gradient.bodies[i].*slot.gradient;
+            if (slot.input == kOrientation) {
+                const Vec4 given = row<4>(inputs[kOrientation].at(0, scene), i);
+                row<4>(rows, i) += covector_to_quaternion_gradient(given, g);
+            } else {
+                row<3>(rows, i) += g;
             }
         }
     }
+    for (const NodeStateSlot& slot : kNodeStateSlots)
+        for (int i = 0; out[slot.input].present() && i < model.node_count(); ++i)
+            row<3>(out[slot.input].at(0, scene), i) += (gradient.*slot.gradient)[i];
+}
+
+/// To what is pushed or to what is driven, whichever a control is read of.
+void write_control_gradient(
+    const Model& model, const RolloutArrays<double>& out, int time, int scene, const SceneControlGradient& gradient) {
+    const auto write = [&](std::size_t k, Vec3 BodyControl::* member) {
+        for (int i = 0; out[k].present() && i < model.body_count(); ++i)
+            if (drives(member) == (model.bodies[i].kind == BodyKind::kinematic))
+                row<3>(out[k].at(time, scene), i) += gradient.bodies[i].*member;
+    };
+    const auto write_nodes = [&](std::size_t k, std::vector<Vec3> SceneControl::* member) {
+        if (!out[k].present()) return;
+        for (const Cloth& cloth : model.cloths)
+            for (int i = 0; i < cloth.node_count(); ++i)
+                if (drives(member) == (cloth.pinned[i] != 0))
+                    row<3>(out[k].at(time, scene), cloth.first_node + i) += (gradient.*member)[cloth.first_node + i];
+    };
+    for_each_input<InputKind::control>(write, write_nodes);
+}
+
+void write_parameter_gradient(const RolloutArrays<double>& out, int scene, const ParameterGradient& gradient) {
+    const auto write_vector = [&](std::size_t k, Vec3 Parameters::* member) {
+        if (out[k].present()) row<3>(out[k].at(0, scene), 0) += gradient.*member;
+    };
+    const auto write_numbers = [&](std::size_t k, std::vector<double> Parameters::* member) {
+        for (std::size_t i = 0; out[k].present() && i < (gradient.*member).size(); ++i)
+            out[k].at(0, scene)[i] += (gradient.*member)[i];
+    };
+    const auto write_matrices = [&](std::size_t k, std::vector<Mat3> Parameters::* member) {
+        for (std::size_t i = 0; out[k].present() && i < (gradient.*member).size(); ++i)
+            Eigen::Map<Mat3>(out[k].at(0, scene) + 9 * i) += (gradient.*member)[i];
+    };
+    const auto write_of_cloths = [&](std::size_t k, double ClothParameters::* member) {
+        for (std::size_t i = 0; out[k].present() && i < gradient.cloths.size(); ++i)
+            out[k].at(0, scene)[i] += gradient.cloths[i].*member;
+    };
+    for_each_input<InputKind::parameter>(write_vector, write_numbers, write_matrices, write_of_cloths);
 }
 
 void write_gradient(
     const Tape& tape, const RolloutInputs& inputs, const RolloutArrays<double>& out, int scene,
     const SceneGradient& gradient) {
-    const int count = tape.model->body_count();
-    const auto add3 = [](const BatchedView<double>& view, int time, int batch, int body, const Vec3& value) {
-        if (view.present()) row<3>(view.at(time, batch), body) += value;
-    };
-    for (int i = 0; i < count; ++i) {
-        const BodyStateGradient& g = gradient.state.bodies[i];
-        add3(out.position, 0, scene, i, g.position);
-        add3(out.velocity, 0, scene, i, g.velocity);
-        add3(out.angular_velocity, 0, scene, i, g.angular_velocity);
-        if (out.orientation.present()) {
-            const Vec4 given = row<4>(inputs.orientation.at(0, scene), i);
-            row<4>(out.orientation.at(0, scene), i) += covector_to_quaternion_gradient(given, g.orientation);
-        }
-        if (out.mass.present()) out.mass.at(0, scene)[i] += gradient.parameters.mass[i];
-        if (out.inertia.present()) Eigen::Map<Mat3>(out.inertia.at(0, scene) + 9 * i) += gradient.parameters.inertia[i];
-        const bool kinematic = tape.model->bodies[i].kind == BodyKind::kinematic;
-        for (int time = 0; time < static_cast<int>(gradient.control.size()); ++time) {
-            const BodyControl& c = gradient.control[time].bodies[i];
-            if (kinematic) {
-                add3(out.body_velocity, time, scene, i, c.velocity);
-                add3(out.body_angular_velocity, time, scene, i, c.angular_velocity);
-            } else {
-                add3(out.force, time, scene, i, c.force);
-                add3(out.torque, time, scene, i, c.torque);
-            }
-        }
-    }
-    if (out.gravity.present()) row<3>(out.gravity.at(0, scene), 0) += gradient.parameters.gravity;
-    for (std::size_t i = 0; out.friction.present() && i < gradient.parameters.friction.size(); ++i)
-        out.friction.at(0, scene)[i] += gradient.parameters.friction[i];
-    write_cloth_gradient(*tape.model, out, scene, gradient);
+    write_state_gradient(*tape.model, inputs, out, scene, gradient.state);
+    for (int time = 0; time < static_cast<int>(gradient.control.size()); ++time)
+        write_control_gradient(*tape.model, out, time, scene, gradient.control[time]);
+    write_parameter_gradient(out, scene, gradient.parameters);
 }
 
 // --- gradients that are not finite ---------------------------------------------------------------------------------
@@ -188,69 +224,62 @@ public:
     FaultCollector(const Model& model, double limit) : m_model(model), m_limit(limit) {}
 
     void add_state(const SceneStateGradient& gradient) {
-        for (int i = 0; i < m_model.body_count(); ++i) {
-            const BodyStateGradient& g = gradient.bodies[i];
-            look("state.position", i, g.position);
-            look("state.orientation", i, g.orientation);
-            look("state.velocity", i, g.velocity);
-            look("state.angular_velocity", i, g.angular_velocity);
-        }
-        look_at_nodes("state.node_position", gradient.node_position);
-        look_at_nodes("state.node_velocity", gradient.node_velocity);
+        for (const BodyStateSlot& slot : kBodyStateSlots)
+            for (int i = 0; i < m_model.body_count(); ++i) look(slot.input, i, gradient.bodies[i].*slot.gradient);
+        for (const NodeStateSlot& slot : kNodeStateSlots) look_at_nodes(slot.input, gradient.*slot.gradient);
     }
 
     void add_control(const RolloutArrays<double>& wanted, const SceneControlGradient& gradient) {
-        for (int i = 0; i < m_model.body_count(); ++i) {
-            const BodyControl& g = gradient.bodies[i];
-            if (wanted.force.present()) look("control.force", i, g.force);
-            if (wanted.torque.present()) look("control.torque", i, g.torque);
-            if (wanted.body_velocity.present()) look("control.body_velocity", i, g.velocity);
-            if (wanted.body_angular_velocity.present()) look("control.body_angular_velocity", i, g.angular_velocity);
-        }
-        if (wanted.node_force.present()) look_at_nodes("control.node_force", gradient.node_force);
-        if (wanted.node_drive.present()) look_at_nodes("control.node_velocity", gradient.node_velocity);
+        const auto look_at_bodies = [&](std::size_t k, Vec3 BodyControl::* member) {
+            for (int i = 0; wanted[k].present() && i < m_model.body_count(); ++i)
+                look(k, i, gradient.bodies[i].*member);
+        };
+        for_each_input<InputKind::control>(
+            look_at_bodies, [&](std::size_t k, std::vector<Vec3> SceneControl::* member) {
+                if (wanted[k].present()) look_at_nodes(k, gradient.*member);
+            });
     }
 
     void add_parameters(const RolloutArrays<double>& wanted, const ParameterGradient& gradient) {
-        for (int i = 0; i < m_model.body_count(); ++i) {
-            if (wanted.mass.present()) look("mass", i, Vector<1>(gradient.mass[i]));
-            if (wanted.inertia.present()) look("inertia", i, gradient.inertia[i]);
-        }
-        if (wanted.gravity.present()) look("gravity", kNobody, gradient.gravity);
-        for (std::size_t i = 0; wanted.friction.present() && i < gradient.friction.size(); ++i)
-            look("friction", is_ground(i) ? kGround : static_cast<int>(i), Vector<1>(gradient.friction[i]));
-        for (int c = 0; c < m_model.cloth_count(); ++c) {
-            const ClothParameters& g = gradient.cloths[c];
-            const int object = m_model.body_count() + c;
-            if (wanted.cloth_density.present()) look("cloth_density", object, Vector<1>(g.density));
-            if (wanted.cloth_stretch.present()) look("cloth_stretch", object, Vector<1>(g.stretch));
-            if (wanted.cloth_shear.present()) look("cloth_shear", object, Vector<1>(g.shear));
-            if (wanted.cloth_bend.present()) look("cloth_bend", object, Vector<1>(g.bend));
-            if (wanted.cloth_damping.present()) look("cloth_damping", object, Vector<1>(g.damping));
-        }
-    }
-
-    bool is_ground(std::size_t object) const {
-        return static_cast<int>(object) == m_model.body_count() + m_model.cloth_count();
+        const auto look_at_vector = [&](std::size_t k, Vec3 Parameters::* member) {
+            if (wanted[k].present()) look(k, kNobody, gradient.*member);
+        };
+        const auto look_at_rows = [&](std::size_t k, auto Parameters::* member) {
+            for (std::size_t i = 0; wanted[k].present() && i < (gradient.*member).size(); ++i)
+                look(k, object_at(i), (gradient.*member)[i]);
+        };
+        const auto look_at_cloths = [&](std::size_t k, double ClothParameters::* member) {
+            for (int c = 0; wanted[k].present() && c < m_model.cloth_count(); ++c)
+                look(k, m_model.body_count() + c, gradient.cloths[c].*member);
+        };
+        for_each_input<InputKind::parameter>(look_at_vector, look_at_rows, look_at_cloths);
     }
 
     bool any() const { return !m_fault.gradients.empty(); }
     GradientFault& fault() { return m_fault; }
 
 private:
+    /// Of rows along the axis of bodies or that of objects.
+    int object_at(std::size_t index) const {
+        const int object = static_cast<int>(index);
+        return object == m_model.body_count() + m_model.cloth_count() ? kGround : object;
+    }
+
+    bool look(std::size_t input, int object, double value) { return look(input, object, Vector<1>(value)); }
+
     template <typename Matrix>
-    bool look(const char* name, int object, const Matrix& value) {
+    bool look(std::size_t input, int object, const Matrix& value) {
         if ((value.array().abs() <= m_limit).all()) return true;
-        add_once(m_fault.gradients, std::string(name));
+        add_once(m_fault.gradients, std::string(kInputs[input].label));
         if (object != kNobody) add_once(m_fault.objects, object);
         return false;
     }
 
-    void look_at_nodes(const char* name, const std::vector<Vec3>& values) {
+    void look_at_nodes(std::size_t input, const std::vector<Vec3>& values) {
         for (int c = 0; c < m_model.cloth_count(); ++c)
             for (int k = 0; k < m_model.cloths[c].node_count(); ++k) {
                 const int node = m_model.cloths[c].first_node + k;
-                if (!look(name, m_model.body_count() + c, values[node])) add_once(m_fault.nodes, node);
+                if (!look(input, m_model.body_count() + c, values[node])) add_once(m_fault.nodes, node);
             }
     }
 
@@ -265,14 +294,13 @@ private:
 };
 
 bool upstream_is_finite(const Model& model, const TrajectoryArrays<const double>& upstream, int time, int scene) {
-    const auto finite = [&](const BatchedView<const double>& view, int count) {
-        const double* begin = view.present() ? view.at(time, scene) : nullptr;
-        return begin == nullptr || std::all_of(begin, begin + count, [](double x) { return std::isfinite(x); });
-    };
-    const int n = model.body_count(), nodes = model.node_count();
-    return finite(upstream.position, 3 * n) && finite(upstream.orientation, 4 * n) &&
-           finite(upstream.velocity, 3 * n) && finite(upstream.angular_velocity, 3 * n) &&
-           finite(upstream.node_position, 3 * nodes) && finite(upstream.node_velocity, 3 * nodes);
+    for (std::size_t k = 0; k < kStateCount; ++k) {
+        if (!upstream[k].present()) continue;
+        const double* begin = upstream[k].at(time, scene);
+        const int count = row_count(model, kInputs[k].axis) * row_shape(kInputs[k]).axes[0];
+        if (!std::all_of(begin, begin + count, [](double x) { return std::isfinite(x); })) return false;
+    }
+    return true;
 }
 
 }  // namespace
@@ -312,9 +340,9 @@ void rollout_backward(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
     const RolloutArrays<double>& gradient, int thread_count, Interrupt* interrupt) {
     std::vector<SceneGradient> scenes(static_cast<std::size_t>(tape.shape.batch));
-    const bool keep_controls = gradient.force.present() || gradient.torque.present() || gradient.node_force.present() ||
-                               gradient.body_velocity.present() || gradient.body_angular_velocity.present() ||
-                               gradient.node_drive.present();
+    bool keep_controls = false;
+    for (std::size_t k = 0; k < kInputCount; ++k)
+        keep_controls = keep_controls || (kind_of(kInputs[k]) == InputKind::control && gradient[k].present());
     for_each_scene(*tape.model, tape.shape.batch, thread_count, interrupt, [&](int scene, StepWorkspace& workspace) {
         scenes[scene] = scene_backward(
             tape, inputs, upstream, gradient, scene, keep_controls, workspace, [](const auto&...) { return true; });

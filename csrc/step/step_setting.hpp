@@ -20,14 +20,8 @@ struct StepSetting {
     double body_weight() const { return part == StepPart::places ? 2.0 : 1.0; }
 };
 
-/// d(loss)/d(Parameters).
-struct ParameterGradient {
-    std::vector<double> mass;
-    std::vector<Mat3> inertia;
-    Vec3 gravity = Vec3::Zero();
-    std::vector<ClothParameters> cloths;
-    std::vector<double> friction;  ///< one per object; empty where there is none
-};
+/// d(loss)/d(Parameters): as many entries, of friction none where there is none.
+using ParameterGradient = Parameters;
 
 /// Numbers whose squares are larger count as overflown, be it on the way or in a state: what is computed from smaller ones
 /// is finite, and so it is where single precision is asked for.

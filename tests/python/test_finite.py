@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import pickle
 import warnings
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 import diffsim as ds
+from diffsim._outcome import gradient_error
 
 HUGE = 1e308
 CONTROLS = ("force", "torque", "node_force", "body_velocity", "body_angular_velocity", "node_velocity")
@@ -57,6 +60,13 @@ def test_a_gradient_that_overflows_names_step_scene_and_body() -> None:
         assert velocity.grad is None
     again = pickle.loads(pickle.dumps(error))
     assert (again.step, again.scene, again.gradients, again.bodies) == (error.step, 1, error.gradients, ("box",))
+
+
+def test_a_gradient_of_the_grounds_friction_names_the_ground() -> None:
+    """The core numbers it -1, from behind."""
+    fault: Any = SimpleNamespace(args=(0, 3, ["friction"], [-1, 0], []))
+    error = gradient_error(two_bodies()._model, fault)
+    assert error.bodies == ("ground", "ball")
 
 
 def test_a_step_between_is_named() -> None:

@@ -1,14 +1,18 @@
 """Importing diffsim is cheap: what only some users need is loaded when they need it."""
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+import diffsim
 
 LAZY_MODULES = (
     *("trimesh", "fcl", "matplotlib", "scipy", "tqdm", "mujoco", "gymnasium"),
     *("k3d", "imageio_ffmpeg", "PIL", "rerun"),
-    *("diffsim.diagnostics", "diffsim.interop", "diffsim.viewer"),
+    *("diffsim.diagnostics", "diffsim.interop", "diffsim.viewer", "diffsim.scene", "diffsim.simulator"),
 )
 
 
@@ -30,14 +34,23 @@ def test_import_does_not_load(module: str, loaded: set[str]) -> None:
     assert module not in loaded
 
 
+def test_the_ops_of_torch_compile_are_registered_when_they_are_traced() -> None:
+    assert "diffsim._compiled" not in modules_loaded_by("import torch, diffsim; diffsim.Simulator")
+
+
 def test_loaded_modules_are_seen() -> None:
     assert "trimesh" in modules_loaded_by("import trimesh")
 
 
 def test_public_names_exist() -> None:
-    import diffsim
-
     assert diffsim.__all__
     missing = [name for name in diffsim.__all__ if not hasattr(diffsim, name)]
     assert not missing
     assert set(diffsim.__all__) <= set(dir(diffsim))
+
+
+def test_type_checkers_see_what_is_loaded_later() -> None:
+    tree = ast.parse(Path(diffsim.__file__).read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    told = {alias.name for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert told | {"Control", "State"} == set(diffsim.__all__)

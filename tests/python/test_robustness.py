@@ -239,12 +239,11 @@ def test_a_state_of_ours_in_the_ground_is_held_and_told() -> None:
     state = sim.initial_state()
     position = state.position.clone()
     position[0, 2] = 0.25 - 1e-3
-    tensors = (position, state.orientation, state.velocity, state.angular_velocity, *(None,) * 8)
-    parameters = (sim.mass, sim.inertia, sim.gravity, sim.friction, *(None,) * 5)
+    inputs = sim._checked_inputs("test", state.replace(position=position), None, None).inputs
     with pytest.raises(ValueError, match="penetrate"):
-        rollout(RolloutCall(sim._model, sim._options, 2, 1), *tensors, *parameters)
+        rollout(RolloutCall(sim._model, sim._options, 2, 1), *inputs)
     call = RolloutCall(sim._model, sim._options, 2, 1, first_step=4)
-    end = rollout(call, *tensors, *parameters)
+    end = rollout(call, *inputs)
     assert torch.equal(end[0], position)
     assert call.info is not None
     assert call.info.failed_steps == 2
