@@ -127,7 +127,10 @@ def _legacy_rows(backward_call: _BackwardCall, tensors: tuple[Tensor | None, ...
 
 
 def _any_requires_grad(tensors: Any) -> bool:
-    return any(t is not None and t.requires_grad for t in tensors)
+    for t in tensors:  # noqa: SIM110, twice as fast as any() over a generator
+        if t is not None and t.requires_grad:
+            return True
+    return False
 
 
 def _refuse_tangents(inputs: tuple[Tensor | None, ...]) -> None:
