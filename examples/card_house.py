@@ -272,7 +272,7 @@ def gradient_error(throw: Throw, launch: Tensor, slope: Tensor) -> float:
     along = slope / slope.norm()
     with torch.no_grad():
         ahead, behind = throw.aside(throw(torch.stack([launch + EPS * along, launch - EPS * along]))).tolist()
-    return abs(float(slope.norm()) * 2.0 * EPS / (ahead - behind) - 1.0)
+    return float(abs(float(slope.norm()) * 2.0 * EPS / (ahead - behind) - 1.0))
 
 
 def check(throw: Throw, search: Search, falls: Sequence[ds.State], stands: Stand, slides: Stand) -> bool:

@@ -102,7 +102,7 @@ def test_throw_bunny_says_in_a_line_that_there_is_no_such_mesh(
     [
         ("lift_figurines", ["--quick"], 11),
         ("dominoes", ["--quick"], 8),
-        ("trampoline", ["--quick"], 7),
+        ("trampoline", ["--quick"], 9),
         ("hanging_cloth", ["--quick"], 10),
         ("marble_inverse", ["--quick"], 7),
     ],
@@ -189,6 +189,17 @@ def test_balance_ball_plays_ppo(monkeypatch: pytest.MonkeyPatch) -> None:
     curve = module.by_ppo(task, 0, 2 * module.STEPS)
     assert curve.steps == [0, 2 * module.STEPS]
     assert 0.0 < curve.held[-1] < module.SIDE
+
+
+def test_dominoes_need_friction_or_sills() -> None:
+    dominoes = load("dominoes")
+    rough, smooth = (
+        dominoes.run_scene(0.01, 0.7, sills=False, friction=friction, quiet=True) for friction in (0.3, 0.0)
+    )
+    fallen, short = (int((run.tilts()[-1] > dominoes.TOPPLED).sum()) for run in (rough, smooth))
+    assert rough.failed == []
+    assert fallen >= 3
+    assert short <= 1
 
 
 def test_card_house_falls_to_the_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
