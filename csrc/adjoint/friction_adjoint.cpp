@@ -7,9 +7,7 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxRounds = 50;  // of multipliers: each leaves 1 / kStickStiffening of the slip, or much more of
-                                // it where many contacts hold one body
-constexpr double kRoundTolerance = 1e-9;  // of the solution: what further rounds would change
+constexpr int kMultiplierRounds = 3;      // of multipliers: each leaves about 1 / kStickStiffening of the slip
 constexpr double kStickStiffening = 1e3;  // of sticking contacts, times their own
 constexpr double kLinearTolerance = 1e-13;
 constexpr int kMaxLinear = 60;
@@ -77,27 +75,16 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
         return result;
     };
     const Coordinates upstream = z;
-    Coordinates last;
-    double last_change = 0.0;
-    for (int round = 0; round < kMaxRounds; ++round) {
+    for (int round = 0; round < (sticks ? kMultiplierRounds : 1); ++round) {
         z = upstream;
         for (const Term& term : m_terms)
             if (term.sticks) scatter(m_zone, term, -1.0, SmallVector(term.slip.transpose() * term.multiplier), z);
         system.solve_in_place(z);
         gmres(m_zone, apply, kLinearTolerance, kMaxLinear, z);
-        if (!sticks) break;
         for (Term& term : m_terms)
             if (term.sticks)
                 term.multiplier +=
                     kStickStiffening * term.stiffness * (term.rows.transpose() * gather(m_zone, term, z));
-        if (round > 0) {
-            add(-1.0, z, last);
-            const double change = std::sqrt(mass_dot(m_zone, last, last)), size = std::sqrt(mass_dot(m_zone, z, z));
-            // Changes shrink in proportion: what is left of them is a geometric series.
-            if (change * change <= kRoundTolerance * size * (last_change - change)) break;
-            last_change = change;
-        }
-        last = z;
     }
     return true;
 }

@@ -19,7 +19,7 @@ constexpr double kFlat = 0.1;         // of the slope at the start: that at the 
 constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
-constexpr double kSlipShare = 0.1;      // of what a bound presses its contact by: FrictionRow::reach
+constexpr double kSlipShare = 0.07;     // of what a bound presses its contact by: FrictionRow::reach
 constexpr double kSettledReach = 0.01;  // of its slip
 constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
 
