@@ -5,8 +5,9 @@ its objects turn in the step, r the arms from their centres and s how far they s
 
     F (½ |θ_a|² r_a + ½ |θ_b|² r_b + |s| (|θ_a| + |θ_b|))
 
-to the order of the square of the step; friction itself gives nothing, since |λ| s is what it takes. Besides, contacts
-give back what the last step has compressed them by, F² dt² compliance / (2 reduced mass).
+to the order of the square of the step, and of the next order as much more as |θ_a| + |θ_b| is of 1. Friction itself gives
+nothing, since |λ| s is what it takes. Besides, contacts give back what the last step has compressed them by,
+F² dt² compliance / (2 reduced mass).
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def by_curved_motion(sim: ds.Simulator, contacts: ds.Contacts) -> Tensor:
     apart = shift[0] - shift[1]
     slip = (apart - (apart * contacts.normal).sum(dim=-1, keepdim=True) * contacts.normal).norm(dim=-1)
     curved = sum(0.5 * angle.square() * arm for angle, arm in zip(turn, arms)) + slip * (turn[0] + turn[1])
-    return (contacts.normal_force.norm(dim=-1) * curved).sum()
+    return (contacts.normal_force.norm(dim=-1) * curved * (1.0 + turn[0] + turn[1])).sum()
 
 
 def in_contacts(sim: ds.Simulator, contacts: ds.Contacts) -> Tensor:
