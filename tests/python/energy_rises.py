@@ -5,8 +5,8 @@ its objects turn in the step, r the arms from their centres and s how far they s
 
     F (½ |θ_a|² r_a + ½ |θ_b|² r_b + |s| (|θ_a| + |θ_b|))
 
-to the order of the square of the step, and of the next order as much more as |θ_a| + |θ_b| is of 1. Friction itself gives
-nothing, since |λ| s is what it takes. Besides, contacts give back what the last step has compressed them by,
+to the order of the square of the step, and of the next order as much more as |θ_a| + |θ_b| is of 1. Friction itself
+gives nothing, since |λ| s is what it takes. Besides, contacts give back what the last step has compressed them by,
 F² dt² compliance / (2 reduced mass).
 """
 
