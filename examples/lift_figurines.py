@@ -3,8 +3,7 @@
 As Figs. 5a and 11 of Qiao et al. 2020. The four corners are pinned nodes that move as `Control.node_velocity` says:
 upwards and inwards, gently at first and in the end, and then they are held. The cloth slides under the figurines,
 closes around them and lifts them off the ground, in one problem with them at each step. Contact is frictionless: what
-holds them is the bag. `--friction 0.4` carries them as well; of the steps of 0.02 s one then does not converge, which
-the check says.
+holds them is the bag. `--friction 0.4` carries them as well.
 
 Writes out/lift_figurines.png and checks itself: the exit code says whether all that `check` looks at holds.
 """
