@@ -9,8 +9,8 @@ namespace diffsim {
 
 /// What rows do not see of a contact with friction: as it turns, its force and its slip turn with it.
 struct FrictionTurn : FrictionTerm {
-    std::size_t friction;  ///< index into ContactModel::friction
-    SlipChanges beyond;    ///< what its slip changes by, without the rows
+    std::size_t friction = 0;  ///< index into ContactModel::friction
+    SlipChanges beyond;        ///< what its slip changes by, without the rows
 };
 
 struct ContactModel {

@@ -10,8 +10,7 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxBalanceSteps = 100;
-constexpr int kCrawlAfter =
-    10;  // Newton steps before the model gets simpler: without turns, then with bounds that stay
+constexpr int kCrawlAfter = 10;       // Newton steps before turns are left out, then bounds are kept from following
 constexpr double kBoundChange = 0.1;  // of the largest: bounds that change less may follow again
 constexpr int kMaxFrozenRounds = 10;  // of bounds that stand still
 constexpr int kMaxBisections = 30;    // bisections of a line search

@@ -23,8 +23,7 @@ struct BalanceWorkspace {
 
 /// Solve until no more than `tolerance` is left of the balance, in units of |L⁻¹ g|. `p` holds the start, which pinned nodes
 /// keep, and receives the solution; rows receive their forces and states. `is_settled`: contacts that slip go on, and their
-/// direction is made exact. Scratch: `system`, whose pattern is that of
-/// model.smooth.
+/// direction is made exact. Scratch: `system`, whose pattern is that of model.smooth.
 ModelSolution balance(
     ContactModel& model, const Zone& zone, double tolerance, bool is_settled, BlockSystem& system,
     BalanceWorkspace& workspace, Coordinates& p);
