@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import math
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,3 +112,14 @@ def test_benchmark_prints_its_table(
     for comment in comments:
         if comment.startswith("# plot: "):
             assert (here / comment.removeprefix("# plot: ")).stat().st_size > 5_000
+
+
+def test_fresh_processes_take_the_package_of_the_one_that_starts_them(tmp_path: Path) -> None:
+    """As where the scripts are run from the source tree, whose package is not compiled."""
+    (tmp_path / "diffsim").mkdir()
+    (tmp_path / "diffsim" / "__init__.py").touch()
+    run = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "memory.py"), "--quick"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    assert "peak_mb" in run.stdout
