@@ -19,23 +19,28 @@ constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow 
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
 constexpr double kSlipShare = 0.07;     // of what a bound presses its contact by: FrictionRow::reach
+constexpr double kHoldingShare = 0.01;   // of that, where only slips of sticking contacts are left to end
 constexpr double kSettledReach = 0.01;  // of its slip
 constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
 
 /// One model; the steps of balance() as members.
 class Balance {
 public:
-    Balance(ContactModel& model, const Zone& zone, BlockSystem& system, BalanceWorkspace& workspace, Coordinates& p)
+    Balance(
+        ContactModel& model, const Zone& zone, const BalanceGoal& goal, BlockSystem& system,
+        BalanceWorkspace& workspace, Coordinates& p)
         : m_model(model),
           m_rows(model.rows),
           m_friction(model.friction),
           m_zone(zone),
+          m_goal(goal),
           m_system(system),
           m_w(workspace),
           m_p(p) {}
 
-    ModelSolution run(double tolerance, bool is_settled) {
-        set_reach(is_settled);
+    ModelSolution run() {
+        const double tolerance = m_goal.tolerance;
+        set_reach();
         look();
         const Coordinates start = m_p;
         if (!keep_states()) return m_result;
@@ -76,7 +81,8 @@ private:
     double force(std::size_t r) const { return m_rows[r].stiffness * std::max(0.0, m_w.violation[r]); }
 
     /// Proportional to the load: then all contacts of a face come to their bounds together.
-    void set_reach(bool is_settled) {
+    void set_reach() {
+        const double share = kSlipShare * (m_goal.is_balanced ? kHoldingShare : 1.0);
         std::size_t f = 0;
         visit_runs(m_rows, [&](std::size_t first, std::size_t last) {
             double sum = 0.0;
@@ -90,9 +96,9 @@ private:
                 FrictionRow& slip = m_friction[f];
                 const ContactRow& row = m_rows[slip.normal];
                 const double pressed = count > 0 ? sum / count / row.stiffness : row.range;
-                slip.reach = kSlipShare * slip.coefficient * pressed;
+                slip.reach = share * slip.coefficient * pressed;
                 const double size = slip.slip.norm();
-                if (is_settled && slip.slips && size > kRestingSlip)
+                if (m_goal.is_settled && slip.slips && size > kRestingSlip)
                     slip.reach = std::min(slip.reach, kSettledReach * size);
                 if (slip.is_known) continue;
                 slip.slips = size > slip.reach;
@@ -335,6 +341,7 @@ private:
     std::vector<ContactRow>& m_rows;
     std::vector<FrictionRow>& m_friction;
     const Zone& m_zone;
+    const BalanceGoal& m_goal;
     BlockSystem& m_system;
     BalanceWorkspace& m_w;
     Coordinates& m_p;
@@ -346,9 +353,9 @@ private:
 }  // namespace
 
 ModelSolution balance(
-    ContactModel& model, const Zone& zone, double tolerance, bool is_settled, BlockSystem& system,
-    BalanceWorkspace& workspace, Coordinates& p) {
-    return Balance(model, zone, system, workspace, p).run(tolerance, is_settled);
+    ContactModel& model, const Zone& zone, const BalanceGoal& goal, BlockSystem& system, BalanceWorkspace& workspace,
+    Coordinates& p) {
+    return Balance(model, zone, goal, system, workspace, p).run();
 }
 
 }  // namespace diffsim

@@ -13,6 +13,16 @@
 /// they change by. GMRES with the factor of S solves with it, and with what S leaves out of contacts that turn.
 namespace diffsim {
 
+/// What a model with friction is asked for.
+struct BalanceGoal {
+    double tolerance = 0.0;  ///< of its balance, in units of |L⁻¹ g|
+    /// Contacts mostly go on as in the last model: those that slip in a direction that is made exact. Compressed ones have their
+    /// stiffness, not the secant's.
+    bool is_settled = false;
+    bool turns = false;        ///< what rows do not see of contacts is in the model, too; see FrictionTurn
+    bool is_balanced = false;  ///< only slips of sticking contacts are left to end
+};
+
 /// Memory of balance(), kept from model to model.
 struct BalanceWorkspace {
     Coordinates smooth_p, gradient, step, smooth_step;
@@ -21,11 +31,10 @@ struct BalanceWorkspace {
     std::vector<Vec2> slip, slip_step, pull;
 };
 
-/// Solve until no more than `tolerance` is left of the balance, in units of |L⁻¹ g|. `p` holds the start, which pinned nodes
-/// keep, and receives the solution; rows receive their forces and states. `is_settled`: contacts that slip go on, and their
-/// direction is made exact. Scratch: `system`, whose pattern is that of model.smooth.
+/// Solve it. `p` holds the start, which pinned nodes keep, and receives the solution; rows receive their forces and states.
+/// Scratch: `system`, whose pattern is that of model.smooth.
 ModelSolution balance(
-    ContactModel& model, const Zone& zone, double tolerance, bool is_settled, BlockSystem& system,
-    BalanceWorkspace& workspace, Coordinates& p);
+    ContactModel& model, const Zone& zone, const BalanceGoal& goal, BlockSystem& system, BalanceWorkspace& workspace,
+    Coordinates& p);
 
 }  // namespace diffsim

@@ -27,13 +27,7 @@ public:
         /// Driven bodies leave no room even where the rows are those of where the way ends: something is squeezed there.
         bool squeezes = false;
     };
-    /// What a solution with friction is asked for.
-    struct BalanceGoal {
-        double tolerance = 0.0;  ///< of the model's balance, in units of |L⁻¹ g|
-        /// Contacts mostly go on as in the last model. Compressed ones have their stiffness, not the secant's.
-        bool is_settled = false;
-        bool turns = false;  ///< what rows do not see of contacts with friction is in the model, too; see FrictionTurn
-    };
+    /// Of models with friction.
     void aim_for(const BalanceGoal& goal) { m_goal = goal; }
 
     /// Add what friction does at the point, its contacts' shares of their bounds being those of the last model.

@@ -62,7 +62,8 @@ private:
         m_search.m_result.residual = now.residual;
         m_wanted = std::max(m_search.m_options.tolerance, now.floor);
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
-        m_model.aim_for({tolerance * now.reference, now.residual < kSettled, now.residual < kTurning});
+        m_model.aim_for(
+            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning, now.residual < m_wanted});
         return now;
     }
 
