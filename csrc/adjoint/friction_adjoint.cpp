@@ -7,21 +7,23 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMultiplierRounds = 3;      // of multipliers: each leaves about 1 / kStickStiffening of the slip
-constexpr double kStickStiffening = 1e3;  // of sticking contacts, times their own
-constexpr double kLinearTolerance = 1e-13;
+constexpr double kSpring = 10.0;           // of sticking contacts, times their own: much stiffer ones cost digits
+constexpr double kGive = 1e-2;             // of the springs' inverse: what slips give for their multipliers
+constexpr int kRounds = 3;                 // each leaves about kGive / kSpring of what slips give
+constexpr double kLinearTolerance = 1e-9;  // of a round
 constexpr int kMaxLinear = 60;
 
 }  // namespace
 
 FrictionAdjoint::FrictionAdjoint(const Zone& zone, const ZonePoint& point, const std::vector<ContactFriction>& friction)
     : m_zone(zone) {
+    m_terms.reserve(friction.size());
     for (std::size_t k = 0; k < friction.size(); ++k) {
         const ActiveContact& active = point.active[k];
         if (!(zone.contacts.law(static_cast<std::size_t>(active.index)).friction > 0.0)) continue;
         if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
         Term& term = m_terms.emplace_back();
-        static_cast<FrictionTerm&>(term) = friction_term(zone, point, active.index, active.geometry, friction[k]);
+        make_friction_term(zone, point, active.index, active.geometry, friction[k], term);
         term.contact = active.index;
     }
 }
@@ -51,40 +53,66 @@ void FrictionAdjoint::add_symmetric(const Term& term, const SmallMatrix& matrix,
         });
 }
 
-bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
-    bool sticks = false;
+double FrictionAdjoint::dot(const Unknowns& x, const Unknowns& y) const {
+    double sum = mass_dot(m_zone, x.z, y.z);
+    for (std::size_t k = 0; k < m_terms.size(); ++k)
+        if (m_terms[k].sticks) sum += x.multipliers[k].dot(y.multipliers[k]) / m_terms[k].stiffness;
+    return sum;
+}
+
+bool FrictionAdjoint::factorize(BlockSystem& system) {
+    m_matrices.clear();
     for (Term& term : m_terms) {
-        const double stiffness = term.sticks ? kStickStiffening * term.stiffness : 0.0;
-        const Eigen::Matrix2d along =
-            term.sticks ? Eigen::Matrix2d(stiffness * Eigen::Matrix2d::Identity()) : term.symmetric;
+        term.spring = term.sticks ? kSpring * term.stiffness : 0.0;
+        const Mat2 along = term.sticks ? Mat2(term.spring * Mat2::Identity()) : term.symmetric;
         const SmallMatrix symmetric = term.rows * along * term.rows.transpose();
         add_symmetric(term, symmetric, system);
-        term.beyond = term.changes - symmetric;
-        if (term.sticks) term.beyond += stiffness * term.rows * term.slip;
-        sticks = sticks || term.sticks;
+        SmallMatrix beyond = term.changes - symmetric;
+        if (term.sticks) beyond += term.spring * term.rows * term.slip;
+        m_matrices.add(term, beyond);
     }
-    if (!system.factorize()) return false;
-    const auto apply = [&](const Coordinates& x) {
-        Coordinates result;
-        result.assign_zero(x.bodies.size(), x.nodes.size());
-        for (const Term& term : m_terms)
-            scatter(
-                m_zone, term, 1.0, SmallVector(term.beyond.transpose().lazyProduct(gather(m_zone, term, x))), result);
-        system.solve_in_place(result);
-        add(1.0, x, result);
-        return result;
-    };
-    const Coordinates upstream = z;
-    for (int round = 0; round < (sticks ? kMultiplierRounds : 1); ++round) {
-        z = upstream;
-        for (const Term& term : m_terms)
-            if (term.sticks) scatter(m_zone, term, -1.0, SmallVector(term.slip.transpose() * term.multiplier), z);
-        system.solve_in_place(z);
-        gmres(m_zone, apply, kLinearTolerance, kMaxLinear, z);
-        for (Term& term : m_terms)
-            if (term.sticks)
-                term.multiplier +=
-                    kStickStiffening * term.stiffness * (term.rows.transpose() * gather(m_zone, term, z));
+    return system.factorize();
+}
+/// P⁻¹ A x, with A the system and P the upper triangle of blocks S, Cᵀ, -1/spring, S the system that is factorized.
+FrictionAdjoint::Unknowns FrictionAdjoint::preconditioned(
+    const BlockSystem& system, const Unknowns& x, double give) const {
+    Unknowns result;
+    result.z.assign_zero(x.z.bodies.size(), x.z.nodes.size());
+    result.multipliers.assign(m_terms.size(), Vec2::Zero());
+    m_matrices.add_transposed_product(m_zone, 1.0, x.z, result.z);
+    for (std::size_t k = 0; k < m_terms.size(); ++k) {
+        const Term& term = m_terms[k];
+        if (!term.sticks) continue;
+        result.multipliers[k] =
+            -term.spring * (term.rows.transpose() * gather(m_zone, term, x.z)) - (1.0 - give) * x.multipliers[k];
+        scatter(m_zone, term, -1.0, SmallVector(term.slip.transpose() * result.multipliers[k]), result.z);
+    }
+    system.solve_in_place(result.z);
+    add(1.0, x, result);
+    return result;
+}
+
+bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
+    if (!factorize(system)) return false;
+    const auto apply = [&](const Unknowns& x) { return preconditioned(system, x, kGive); };
+    const auto product = [&](const Unknowns& x, const Unknowns& y) { return dot(x, y); };
+    Unknowns left{z, std::vector<Vec2>(m_terms.size(), Vec2::Zero())};
+    system.solve_in_place(left.z);
+    const Unknowns begin = left;
+    Unknowns x = left;
+    scale(0.0, x);
+    for (int round = 0;;) {
+        gmres(apply, product, kLinearTolerance, kMaxLinear, left);
+        add(1.0, left, x);
+        if (++round == kRounds) break;
+        left = begin;
+        add(-1.0, preconditioned(system, x, 0.0), left);
+    }
+    z = x.z;
+    for (std::size_t k = 0; k < m_terms.size(); ++k) {
+        Term& term = m_terms[k];
+        if (term.sticks)
+            term.multiplier = x.multipliers[k] + term.spring * (term.rows.transpose() * gather(m_zone, term, z));
     }
     return true;
 }

@@ -1,7 +1,9 @@
 #pragma once
 
 #include "adjoint/adjoint.hpp"
+#include "zone/friction_row.hpp"
 #include "zone/friction_term.hpp"
+#include "zone/side_matrices.hpp"
 
 /// Friction in the backward of a zone.
 ///
@@ -9,8 +11,9 @@
 ///     K dy + B dλ = -dF,  C dy = -ds.
 /// K is not symmetric, and C is not Bᵀ, since contacts move with what they touch. The transpose,
 ///     Kᵀ z + Cᵀ ζ = v,  Bᵀ z = 0,
-/// is solved by rounds of multipliers, (Kᵀ + Cᵀ k Bᵀ) z = v - Cᵀ ζ, ζ += k Bᵀ z, each by GMRES with the factor of a symmetric
-/// matrix: H, and what of friction is symmetric.
+/// is solved by GMRES for z and ζ together, with the factor of a symmetric matrix: H, what of friction is symmetric, and
+/// springs along the slips of sticking contacts. Rows that depend on each other leave ζ open: each round gives the second
+/// equation a little of ζ, and the next one takes the error that this makes.
 namespace diffsim {
 
 class FrictionAdjoint {
@@ -32,15 +35,33 @@ public:
 
 private:
     struct Term : FrictionTerm {
-        int contact = 0;                                       ///< index into Zone::contacts
-        SmallMatrix beyond;                                    ///< what the system lacks of it
-        Eigen::Vector2d multiplier = Eigen::Vector2d::Zero();  ///< ζ
+        int contact = 0;                 ///< index into Zone::contacts
+        double spring = 0.0;             ///< sticking: of the system along its slip
+        Vec2 multiplier = Vec2::Zero();  ///< ζ
+    };
+    struct Unknowns {
+        Coordinates z;
+        std::vector<Vec2> multipliers;  ///< of terms that stick; zero elsewhere
+
+        friend void add(double factor, const Unknowns& x, Unknowns& sum) {
+            add(factor, x.z, sum.z);
+            for (std::size_t k = 0; k < x.multipliers.size(); ++k) sum.multipliers[k] += factor * x.multipliers[k];
+        }
+        friend void scale(double factor, Unknowns& x) {
+            scale(factor, x.z);
+            for (Vec2& value : x.multipliers) value *= factor;
+        }
+        friend int count(const Unknowns& x) { return count(x.z) + 2 * static_cast<int>(x.multipliers.size()); }
     };
 
+    bool factorize(BlockSystem& system);
+    Unknowns preconditioned(const BlockSystem& system, const Unknowns& x, double give) const;
+    double dot(const Unknowns& x, const Unknowns& y) const;
     void add_symmetric(const Term& term, const SmallMatrix& matrix, BlockSystem& system) const;
 
     const Zone& m_zone;
     std::vector<Term> m_terms;
+    SideMatrices m_matrices;  // Kᵀ's part of friction with that of the springs, less what the system has of them
 };
 
 }  // namespace diffsim

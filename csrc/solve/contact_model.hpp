@@ -2,15 +2,35 @@
 
 #include "zone/friction_row.hpp"
 #include "zone/friction_term.hpp"
+#include "zone/side_matrices.hpp"
 
 /// The convex model of a zone around its current point, all near contacts in it:
 ///     m(p) = ½ pᵀ H p + gᵀ p + Σ stiffness/2 max(0, missing - rowᵀ p)².
 namespace diffsim {
 
-/// What rows do not see of a contact with friction: as it turns, its force and its slip turn with it.
-struct FrictionTurn : FrictionTerm {
-    std::size_t friction = 0;  ///< index into ContactModel::friction
-    SlipChanges beyond;        ///< what its slip changes by, without the rows
+/// What rows do not see of contacts with friction: as they turn, their forces and their slips turn with them.
+struct FrictionTurns {
+    struct Slip {
+        std::array<ContactTerm::Side, 2> sides;
+        int side_count;
+        std::size_t friction;  ///< index into ContactModel::friction
+        std::size_t force;     ///< index into forces
+        TangentRows rows;
+        SlipChanges beyond;  ///< what its slip changes by, without the rows
+
+        template <class BodyPart, class NodePart>
+        void for_each(const BodyPart& body_part, const NodePart& node_part) const {
+            visit_sides(sides, side_count, body_part, node_part);
+        }
+    };
+    std::vector<Slip> slips;
+    SideMatrices forces;  ///< what the forces on the coordinates change by
+
+    bool empty() const { return slips.empty(); }
+    void clear() {
+        slips.clear();
+        forces.clear();
+    }
 };
 
 struct ContactModel {
@@ -18,7 +38,7 @@ struct ContactModel {
     Coordinates gradient;               ///< g; zero at pinned nodes
     std::vector<ContactRow> rows;       ///< one-sided; those of the same bodies follow each other
     std::vector<FrictionRow> friction;  ///< of rows whose contacts have some, in their order; see friction_model
-    std::vector<FrictionTurn> turns;    ///< of some of them
+    FrictionTurns turns;                ///< of some of them
 };
 
 /// Memory of minimise(), kept from model to model.

@@ -19,7 +19,7 @@ constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow 
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
 constexpr double kSlipShare = 0.07;     // of what a bound presses its contact by: FrictionRow::reach
-constexpr double kHoldingShare = 0.01;   // of that, where only slips of sticking contacts are left to end
+constexpr double kHoldingShare = 0.03;  // of that, where only slips of sticking contacts are left to end
 constexpr double kSettledReach = 0.01;  // of its slip
 constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
 
@@ -39,45 +39,52 @@ public:
           m_p(p) {}
 
     ModelSolution run() {
-        const double tolerance = m_goal.tolerance;
         set_reach();
-        look();
         const Coordinates start = m_p;
-        if (!keep_states()) return m_result;
+        const std::vector<FrictionRow> states = m_friction;
+        if (!m_model.turns.empty()) {
+            if (solve(true)) return m_result;
+            m_model.turns.clear();
+            m_p = start;
+            m_friction = states;
+        }
+        solve(false);
+        return m_result;
+    }
+
+private:
+    /// From where p and the states are. False where it crawls, `may_give_up`, and is given up.
+    bool solve(bool may_give_up) {
+        look();
+        if (!keep_states()) return true;
         int rounds = 0;
         for (int steps = 0;; ++steps) {
             look();
             follow();
             add_all(nullptr);
             const double left = largest_scaled(m_zone, m_w.gradient);
-            if (left <= tolerance && m_frozen) {
+            if (left <= m_goal.tolerance && m_frozen) {
                 m_frozen = let_bounds_follow() > kBoundChange && ++rounds < kMaxFrozenRounds;
                 steps = -1;
                 continue;
             }
-            m_result.status = left <= tolerance ? ModelSolution::Status::solved : ModelSolution::Status::crawling;
-            if (left <= tolerance || m_result.newton_steps >= kMaxBalanceSteps) break;
+            m_result.status =
+                left <= m_goal.tolerance ? ModelSolution::Status::solved : ModelSolution::Status::crawling;
+            if (left <= m_goal.tolerance || m_result.newton_steps >= kMaxBalanceSteps) break;
             if (!m_frozen && steps >= kCrawlAfter) {
-                if (m_model.turns.empty()) {
-                    m_frozen = true;
-                    rounds = 0;
-                } else {
-                    m_model.turns.clear();
-                    m_p = start;
-                    steps = -1;
-                    continue;
-                }
+                if (may_give_up) return false;
+                m_frozen = true;
+                rounds = 0;
             }
             if (!newton_step()) {
                 m_result.status = ModelSolution::Status::indefinite;
-                return m_result;
+                return true;
             }
         }
         keep();
-        return m_result;
+        return true;
     }
 
-private:
     double force(std::size_t r) const { return m_rows[r].stiffness * std::max(0.0, m_w.violation[r]); }
 
     /// Proportional to the load: then all contacts of a face come to their bounds together.
@@ -115,11 +122,7 @@ private:
         slips_times(m_friction, m_rows, m_p, m_w.slip);
         for (std::size_t f = 0; f < m_friction.size(); ++f)
             m_w.slip[f] += m_friction[f].slip + m_friction[f].reach * m_friction[f].multiplier;
-        for (const FrictionTurn& turn : m_model.turns) {
-            const SmallVector q = gather(m_zone, turn, m_p);
-            m_w.slip[turn.friction] += turn.beyond * q;
-            scatter(m_zone, turn, 1.0, turn.changes * q, m_w.smooth_p);
-        }
+        add_turns(m_p, m_w.slip, m_w.smooth_p);
     }
 
     /// Who pushes and who slips at p, and the balance there.
@@ -210,16 +213,27 @@ private:
             const double change = slip.coefficient * m_rows[slip.normal].stiffness * m_w.slope[slip.normal];
             diffsim::add_friction(slip, m_rows[slip.normal], change * slip.share, result);
         }
-        for (const FrictionTurn& turn : m_model.turns) {
-            const SmallVector q = gather(m_zone, turn, x);
-            const std::size_t f = turn.friction;
-            const Vec2& u = m_friction[f].share;
-            Vec2 w = turn.beyond * q;
-            if (m_friction[f].slips) w -= u * u.dot(w);
-            const double k = m_w.bound[f] / std::max(m_w.slip[f].norm(), m_friction[f].reach);
-            scatter(m_zone, turn, -1.0, turn.changes * q + turn.rows * (k * w), result);
-        }
+        m_w.turned.add_product(m_zone, -1.0, x, result);
         return result;
+    }
+
+    /// What contacts that turn do along a motion: to their slips, and to the forces.
+    void add_turns(const Coordinates& motion, std::vector<Vec2>& slips, Coordinates& forces) const {
+        for (const FrictionTurns::Slip& turn : m_model.turns.slips)
+            slips[turn.friction] += turn.beyond * gather(m_zone, turn, motion);
+        m_model.turns.forces.add_product(m_zone, 1.0, motion, forces);
+    }
+
+    /// The forces of contacts that turn, with those that their slips bring about.
+    void make_turned() {
+        m_w.turned = m_model.turns.forces;
+        for (const FrictionTurns::Slip& turn : m_model.turns.slips) {
+            const FrictionRow& slip = m_friction[turn.friction];
+            SlipChanges w = turn.beyond;
+            if (slip.slips) w -= slip.share * (slip.share.transpose() * turn.beyond);
+            const double k = m_w.bound[turn.friction] / std::max(m_w.slip[turn.friction].norm(), slip.reach);
+            m_w.turned[turn.force] += turn.rows.lazyProduct(k * w);
+        }
     }
 
     /// The Newton step, by S alone or with bounds that follow.
@@ -228,6 +242,7 @@ private:
         scale(-1.0, m_w.step);
         m_system.solve_in_place(m_w.step);
         if (!with_bounds && m_model.turns.empty()) return;
+        make_turned();
         const auto apply = [&](const Coordinates& x) {
             Coordinates result = left_out(x);
             m_system.solve_in_place(result);
@@ -235,7 +250,8 @@ private:
             add(1.0, x, result);
             return result;
         };
-        gmres(m_zone, apply, kLinearTolerance, kMaxLinear, m_w.step);
+        const auto product = [&](const Coordinates& a, const Coordinates& b) { return mass_dot(m_zone, a, b); };
+        gmres(apply, product, kLinearTolerance, kMaxLinear, m_w.step);
     }
 
     bool bounds_matter() const {
@@ -297,11 +313,7 @@ private:
         rows_times(m_rows, m_w.step, m_w.slope);
         slips_times(m_friction, m_rows, m_w.step, m_w.slip_step);
         m_model.smooth.multiply(m_w.step, m_w.smooth_step);
-        for (const FrictionTurn& turn : m_model.turns) {
-            const SmallVector q = gather(m_zone, turn, m_w.step);
-            m_w.slip_step[turn.friction] += turn.beyond * q;
-            scatter(m_zone, turn, 1.0, turn.changes * q, m_w.smooth_step);
-        }
+        add_turns(m_w.step, m_w.slip_step, m_w.smooth_step);
         m_first = dot(m_w.step, m_model.gradient) + dot(m_w.step, m_w.smooth_p);
         m_second = dot(m_w.step, m_w.smooth_step);
     }

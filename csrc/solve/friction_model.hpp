@@ -19,7 +19,7 @@ struct BalanceGoal {
     /// Contacts mostly go on as in the last model: those that slip in a direction that is made exact. Compressed ones have their
     /// stiffness, not the secant's.
     bool is_settled = false;
-    bool turns = false;        ///< what rows do not see of contacts is in the model, too; see FrictionTurn
+    bool turns = false;        ///< what rows do not see of contacts is in the model, too; see FrictionTurns
     bool is_balanced = false;  ///< only slips of sticking contacts are left to end
 };
 
@@ -29,6 +29,7 @@ struct BalanceWorkspace {
     std::vector<double> violation, slope, bound;
     std::vector<char> pushes;
     std::vector<Vec2> slip, slip_step, pull;
+    SideMatrices turned;
 };
 
 /// Solve it. `p` holds the start, which pinned nodes keep, and receives the solution; rows receive their forces and states.

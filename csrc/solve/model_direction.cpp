@@ -206,8 +206,7 @@ void ModelDirection::make_start_row(const NearContact& near) {
 /// few steps each.
 bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
     if (!m_model.friction.empty()) {
-        const ModelSolution balanced =
-            balance(m_model, m_zone, m_goal, m_system, m_balance, p);
+        const ModelSolution balanced = balance(m_model, m_zone, m_goal, m_system, m_balance, p);
         newton_steps += balanced.newton_steps;
         m_right_guess = balanced.newton_steps == 1;
         return balanced.status != ModelSolution::Status::indefinite;

@@ -80,16 +80,16 @@ void ModelDirection::add_friction_row(const NearContact& near, const ContactGeom
 }
 
 void ModelDirection::add_turns() {
+    FrictionTerm term;
     for (std::size_t f = 0; f < m_model.friction.size(); ++f) {
         const FrictionRow& slip = m_model.friction[f];
         const NearContact& near = m_near[slip.normal];
         if (!slip.is_known || !(m_model.rows[slip.normal].force > 0.0)) continue;
-        FrictionTurn& turn = m_model.turns.emplace_back();
         const FrictionState& state = m_friction[static_cast<std::size_t>(near.contact)];
-        static_cast<FrictionTerm&>(turn) =
-            friction_term(m_zone, m_point, near.contact, near.geometry, {state.share, false});
-        turn.friction = f;
-        turn.beyond = turn.slip - turn.rows.transpose();
+        make_friction_term(m_zone, m_point, near.contact, near.geometry, {state.share, false}, term);
+        const std::size_t force = m_model.turns.forces.add(term, term.changes);
+        m_model.turns.slips.push_back(
+            {term.sides, term.side_count, f, force, term.rows, term.slip - term.rows.transpose()});
     }
 }
 

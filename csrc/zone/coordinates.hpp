@@ -36,6 +36,9 @@ inline void add(double factor, const Coordinates& a, Coordinates& sum) {
     for (std::size_t i = 0; i < a.nodes.size(); ++i) sum.nodes[i] += factor * a.nodes[i];
 }
 
+/// How many numbers they are.
+inline int count(const Coordinates& a) { return static_cast<int>(6 * a.bodies.size() + 3 * a.nodes.size()); }
+
 /// a *= factor
 inline void scale(double factor, Coordinates& a) {
     for (Vec6& value : a.bodies) value *= factor;

@@ -12,15 +12,17 @@ namespace {
 
 constexpr double kRestingSlip = 1e-11;  // [m]: what slips by less has no direction, and counts as sticking
 
-using Rates = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, 18>;
-using Rate = Eigen::Matrix<double, 1, Eigen::Dynamic, Eigen::RowMajor, 1, 18>;
-
 /// How a contact changes, to first order, when its sides are elsewhere.
+template <int kSize>
 struct Changes {
-    Rates point, normal;           ///< where the surfaces meet; the normal
-    Rate force;                    ///< the contact's own
-    std::array<Rates, 2> weights;  ///< of cloth: of each side's three nodes
+    using Rates = Eigen::Matrix<double, 3, kSize>;
+    using Rate = Eigen::Matrix<double, 1, kSize>;
+    Rates point = Rates::Zero(), normal = Rates::Zero();            ///< where the surfaces meet; the normal
+    Rate force = Rate::Zero();                                      ///< the contact's own
+    std::array<Rates, 2> weights = {Rates::Zero(), Rates::Zero()};  ///< of cloth: of each side's three nodes
 };
+template <class A, class B>
+using ChangesOf = Changes<A::kSize + B::kSize>;
 
 /// d(closest point of the feature), its place on the feature held.
 template <class Motion>
@@ -52,23 +54,24 @@ struct Kind<GroundSide> {
 template <class A, class B>
 void add_closest_changes(
     const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b, int count_a, int count_b,
-    double share, Changes& changes) {
+    double share, ChangesOf<A, B>& changes) {
     const auto motion_a = motion_of(a, geometry.closest.a.point);
     const auto motion_b = motion_of(b, geometry.closest.b.point);
     constexpr int kA = A::kSize, kB = B::kSize;
+    using Rates = typename ChangesOf<A, B>::Rates;
     const Vec3& n = geometry.normal;
     const double d = geometry.distance;
-    Rates Wa = Rates::Zero(3, kA + kB), Wb = Rates::Zero(3, kA + kB);
-    Wa.leftCols(kA) = material_rows(motion_a);
-    Wb.rightCols(kB) = material_rows(motion_b);
+    Rates Wa = Rates::Zero(), Wb = Rates::Zero();
+    Wa.template leftCols<kA>() = material_rows(motion_a);
+    Wb.template rightCols<kB>() = material_rows(motion_b);
     Rates W = Wa - Wb;
     const int count = count_a + count_b;
     if (count > 0) {
         const std::array<Vec3, 2> slides_a = slide_directions(geometry.closest.a, n),
                                   slides_b = slide_directions(geometry.closest.b, n);
         Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, 4> S(3, count);
-        Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, 4, 18> right =
-            Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, 4, 18>::Zero(count, kA + kB);
+        using Slides = Eigen::Matrix<double, Eigen::Dynamic, kA + kB, 0, 4, kA + kB>;
+        Slides right = Slides::Zero(count, kA + kB);
         for (int k = 0; k < count_a; ++k) {
             const Vec3& slide = slides_a[static_cast<std::size_t>(k)];
             S.col(k) = slide;
@@ -83,7 +86,7 @@ void add_closest_changes(
         }
         right += S.transpose() * W;
         const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, 4, 4> gram = S.transpose() * S;
-        const Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, 4, 18> sigma = -gram.fullPivLu().solve(right);
+        const Slides sigma = -gram.fullPivLu().solve(right);
         for (int k = 0; k < count_a; ++k) {
             Wa += slides_a[static_cast<std::size_t>(k)] * sigma.row(k);
             if constexpr (Kind<A>::is_cloth)
@@ -102,8 +105,8 @@ void add_closest_changes(
 
 /// What the mollifier of nearly parallel edges changes by.
 template <class A, class B>
-Rate mollifier_change(const ContactGeometry& geometry, const A& a, const B& b) {
-    Rate result = Rate::Zero(1, A::kSize + B::kSize);
+typename ChangesOf<A, B>::Rate mollifier_change(const ContactGeometry& geometry, const A& a, const B& b) {
+    typename ChangesOf<A, B>::Rate result = ChangesOf<A, B>::Rate::Zero();
     if (geometry.sine_sq >= kParallelLimit) return result;
     const auto motion_a = motion_of(a, geometry.closest.a.point);
     const auto motion_b = motion_of(b, geometry.closest.b.point);
@@ -117,10 +120,8 @@ Rate mollifier_change(const ContactGeometry& geometry, const A& a, const B& b) {
 }
 
 template <class A, class B>
-Changes find_changes(const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b) {
-    constexpr int kSize = A::kSize + B::kSize;
-    Changes changes;
-    changes.point = changes.normal = changes.weights[0] = changes.weights[1] = Rates::Zero(3, kSize);
+ChangesOf<A, B> find_changes(const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b) {
+    ChangesOf<A, B> changes;
     const ClosestPoint &on_a = geometry.closest.a, &on_b = geometry.closest.b;
     const PotentialValue push = normal_force(law, geometry.distance);
     if constexpr (std::is_same_v<B, GroundSide>) {
@@ -137,7 +138,7 @@ Changes find_changes(const ContactGeometry& geometry, const ContactLaw& law, con
                 geometry, law, a, b, on_a.slide_count - on_a.border_count, on_b.slide_count - on_b.border_count, 0.5,
                 changes);
         }
-        const Rate distance =
+        const typename ChangesOf<A, B>::Rate distance =
             relative_row(motion_of(a, on_a.point), motion_of(b, on_b.point), geometry.normal).transpose();
         changes.force = -edge_mollifier(geometry.sine_sq).value * push.stiffness * distance +
                         push.force * mollifier_change(geometry, a, b);
@@ -146,16 +147,21 @@ Changes find_changes(const ContactGeometry& geometry, const ContactLaw& law, con
 }
 
 /// Puts the term together, side by side.
+template <class A, class B>
 class TermMaker {
 public:
     TermMaker(
         const Zone& zone, const ZonePoint& point, const ZoneContact& contact, const ContactGeometry& geometry,
         const ContactFriction& friction, FrictionTerm& term)
-        : m_zone(zone), m_point(point), m_geometry(geometry), m_contact(contact), m_friction(friction), m_term(term) {}
+        : m_zone(zone),
+          m_point(point),
+          m_geometry(geometry),
+          m_contact(contact),
+          m_friction(friction),
+          m_term(term),
+          m_frame(friction_frame(geometry, contact.law)) {}
 
-    template <class A, class B>
     void make(const PlacedSide<A>& placed_a, const PlacedSide<B>& placed_b) {
-        constexpr int kSize = A::kSize + B::kSize;
         set_side(m_term.sides[0], placed_a);
         set_side(m_term.sides[1], placed_b);
         m_term.sides[1].offset = A::kSize;
@@ -164,50 +170,54 @@ public:
             m_changes = find_changes(m_geometry, m_contact.law, placed_a.side, GroundSide());
         else
             m_changes = find_changes(m_geometry, m_contact.law, placed_a.side, placed_b.side);
-        m_frame = friction_frame(m_geometry, m_contact.law);
-        m_motion = Vec3::Zero();
-        m_motion_of_place = m_motion_of_motion = Rates::Zero(3, kSize);
-        add_motion(placed_a, 1.0, 0);
-        add_motion(placed_b, -1.0, 1);
+        add_motion<0>(placed_a, 1.0);
+        add_motion<A::kSize>(placed_b, -1.0);
         find_slip();
         find_force();
-        m_term.force_of_place = m_term.force_of_motion = SmallMatrix::Zero(kSize, kSize);
         m_term.rows.resize(kSize, 2);
         m_term.force = SmallVector::Zero(kSize);
-        add_force(placed_a, 1.0, 0);
-        add_force(placed_b, -1.0, 1);
+        add_force<0>(placed_a, 1.0);
+        add_force<A::kSize>(placed_b, -1.0);
+        put_together(placed_a, placed_b);
     }
 
 private:
+    static constexpr int kSize = A::kSize + B::kSize;
+    using Rates = Eigen::Matrix<double, 3, kSize>;
+    using Square = Eigen::Matrix<double, kSize, kSize>;
+
     const Vec3& normal() const { return m_geometry.normal; }
-    int offset(int side) const { return m_term.sides[static_cast<std::size_t>(side)].offset; }
     Vec6 motion_of(const PlacedSide<BodySide>& side) const {
         return side.yields ? m_point.y.bodies[side.body] : m_zone.bodies[side.body].target;
     }
 
     // --- relative motion of the material points that meet: v
 
-    void add_motion(const PlacedSide<BodySide>& placed, double sign, int side) {
+    template <int kOffset>
+    void add_motion(const PlacedSide<BodySide>& placed, double sign) {
         const Vec6 y = motion_of(placed);
         const Vec3 arm = m_frame.point - placed.side.center, turn = y.head<3>();
         m_motion += sign * (y.tail<3>() + turn.cross(arm));
         m_motion_of_place += sign * skew(turn) * m_changes.point;
-        m_motion_of_place.middleCols<3>(offset(side) + 3) -= sign * skew(turn);
-        m_motion_of_motion.middleCols<3>(offset(side)) -= sign * skew(arm);
-        m_motion_of_motion.middleCols<3>(offset(side) + 3) += sign * Mat3::Identity();
+        m_motion_of_place.template middleCols<3>(kOffset + 3) -= sign * skew(turn);
+        m_motion_of_motion.template middleCols<3>(kOffset) -= sign * skew(arm);
+        m_motion_of_motion.template middleCols<3>(kOffset + 3) += sign * Mat3::Identity();
     }
-    void add_motion(const PlacedSide<ClothSide>& placed, double sign, int side) {
+    template <int kOffset>
+    void add_motion(const PlacedSide<ClothSide>& placed, double sign) {
         for (int k = 0; k < 3; ++k) {
             const int node = placed.nodes[static_cast<std::size_t>(k)];
             if (node < 0) continue;
             const ZoneNode& of_zone = m_zone.nodes[node];
             const Vec3& y = of_zone.pinned ? of_zone.target : m_point.y.nodes[node];
             m_motion += sign * placed.side.weights[k] * y;
-            m_motion_of_place += sign * y * m_changes.weights[static_cast<std::size_t>(side)].row(k);
-            m_motion_of_motion.middleCols<3>(offset(side) + 3 * k) += sign * placed.side.weights[k] * Mat3::Identity();
+            m_motion_of_place += sign * y * m_changes.weights[kOffset == 0 ? 0 : 1].row(k);
+            m_motion_of_motion.template middleCols<3>(kOffset + 3 * k) +=
+                sign * placed.side.weights[k] * Mat3::Identity();
         }
     }
-    void add_motion(const PlacedSide<GroundSide>&, double, int) {}
+    template <int kOffset>
+    void add_motion(const PlacedSide<GroundSide>&, double) {}
 
     /// s = P v, P the projection along the normal.
     void find_slip() {
@@ -233,7 +243,7 @@ private:
         if (m_term.sticks) {
             m_force = bound * (m_friction.share - n * n.dot(m_friction.share));
             m_force_of_place = -n * (m_force.transpose() * m_changes.normal);
-            m_force_of_motion = Rates::Zero(3, m_slip_of_motion.cols());
+            m_force_of_motion.setZero();
             Eigen::Matrix<double, 2, 3> T;
             T << m_frame.tangents[0].transpose(), m_frame.tangents[1].transpose();
             m_term.slip_of_place = T * m_slip_of_place;
@@ -253,20 +263,21 @@ private:
 
     // --- its forces on the coordinates
 
-    void add_force(const PlacedSide<BodySide>& placed, double sign, int side) {
+    template <int kOffset>
+    void add_force(const PlacedSide<BodySide>& placed, double sign) {
+        constexpr int o = kOffset;
         const Vec6 y = motion_of(placed);
         const Vec3 theta = y.head<3>(), arm = m_frame.point - placed.side.center;
         const Mat3 Jt = left_jacobian(theta).transpose();
-        const int o = offset(side);
         Rates arm_of_place = m_changes.point;
-        arm_of_place.middleCols<3>(o + 3) -= Mat3::Identity();
+        arm_of_place.template middleCols<3>(o + 3) -= Mat3::Identity();
         const Vec3 torque = arm.cross(m_force);
-        m_term.force_of_place.middleRows<3>(o) +=
+        m_force_on_place.template middleRows<3>(o) +=
             sign * Jt * (skew(arm) * m_force_of_place - skew(m_force) * arm_of_place);
-        m_term.force_of_place.middleRows<3>(o + 3) += sign * m_force_of_place;
-        m_term.force_of_motion.middleRows<3>(o) += sign * Jt * skew(arm) * m_force_of_motion;
-        m_term.force_of_motion.middleRows<3>(o + 3) += sign * m_force_of_motion;
-        m_term.force_of_motion.block<3, 3>(o, o) += sign * left_jacobian_transposed_derivative(theta, torque);
+        m_force_on_place.template middleRows<3>(o + 3) += sign * m_force_of_place;
+        m_force_on_motion.template middleRows<3>(o) += sign * Jt * skew(arm) * m_force_of_motion;
+        m_force_on_motion.template middleRows<3>(o + 3) += sign * m_force_of_motion;
+        m_force_on_motion.template block<3, 3>(o, o) += sign * left_jacobian_transposed_derivative(theta, torque);
         for (int k = 0; k < 2; ++k) {
             const Vec3& tangent = m_frame.tangents[static_cast<std::size_t>(k)];
             m_term.rows.col(k).segment<3>(o) = sign * Jt * arm.cross(tangent);
@@ -276,19 +287,44 @@ private:
         m_term.force.segment<3>(o) = sign * Jt * torque;
         m_term.force.segment<3>(o + 3) = sign * m_force;
     }
-    void add_force(const PlacedSide<ClothSide>& placed, double sign, int side) {
+    template <int kOffset>
+    void add_force(const PlacedSide<ClothSide>& placed, double sign) {
         for (int k = 0; k < 3; ++k) {
-            const int o = offset(side) + 3 * k;
+            const int o = kOffset + 3 * k;
             const double weight = placed.side.weights[k];
-            m_term.force_of_place.middleRows<3>(o) +=
-                sign * (m_force * m_changes.weights[static_cast<std::size_t>(side)].row(k) + weight * m_force_of_place);
-            m_term.force_of_motion.middleRows<3>(o) += sign * weight * m_force_of_motion;
+            m_force_on_place.template middleRows<3>(o) +=
+                sign * (m_force * m_changes.weights[kOffset == 0 ? 0 : 1].row(k) + weight * m_force_of_place);
+            m_force_on_motion.template middleRows<3>(o) += sign * weight * m_force_of_motion;
             for (int t = 0; t < 2; ++t)
                 m_term.rows.col(t).segment<3>(o) = sign * weight * m_frame.tangents[static_cast<std::size_t>(t)];
             if (!m_term.sticks) m_term.force.segment<3>(o) = sign * weight * m_force;
         }
     }
-    void add_force(const PlacedSide<GroundSide>&, double, int) {}
+    template <int kOffset>
+    void add_force(const PlacedSide<GroundSide>&, double) {}
+
+    // --- along y, with which places move
+
+    void put_together(const PlacedSide<A>& placed_a, const PlacedSide<B>& placed_b) {
+        Square changes = m_force_on_place;
+        Eigen::Matrix<double, 2, kSize> slip;
+        if (m_term.sticks) slip = m_term.slip_of_place;
+        const auto along_coordinates = [&](const auto& placed, auto offset) {
+            if constexpr (std::is_same_v<std::decay_t<decltype(placed)>, PlacedSide<BodySide>>) {
+                if (!placed.yields) return;
+                const Mat6 chart = chart_jacobian(m_point.y.bodies[placed.body]);
+                changes.template middleCols<6>(offset) = (changes.template middleCols<6>(offset) * chart).eval();
+                if (m_term.sticks)
+                    slip.template middleCols<6>(offset) = (slip.template middleCols<6>(offset) * chart).eval();
+            }
+        };
+        along_coordinates(placed_a, std::integral_constant<int, 0>());
+        along_coordinates(placed_b, std::integral_constant<int, A::kSize>());
+        m_term.force_of_place = m_force_on_place;
+        m_term.force_of_motion = m_force_on_motion;
+        m_term.changes = changes + m_force_on_motion;
+        if (m_term.sticks) m_term.slip = slip + m_term.slip_of_motion;
+    }
 
     const Zone& m_zone;
     const ZonePoint& m_point;
@@ -296,35 +332,29 @@ private:
     const ZoneContact m_contact;
     const ContactFriction& m_friction;
     FrictionTerm& m_term;
-    Changes m_changes;
     FrictionFrame m_frame;
-    Vec3 m_motion, m_slip, m_force;
-    Rates m_motion_of_place, m_motion_of_motion, m_slip_of_place, m_slip_of_motion, m_force_of_place, m_force_of_motion;
+    Changes<kSize> m_changes;
+    Vec3 m_motion = Vec3::Zero(), m_slip, m_force;
+    Rates m_motion_of_place = Rates::Zero(), m_motion_of_motion = Rates::Zero();
+    Rates m_slip_of_place, m_slip_of_motion, m_force_of_place, m_force_of_motion;
+    Square m_force_on_place = Square::Zero(), m_force_on_motion = Square::Zero();
 };
+
+/// What kind of side it is, for decltype.
+template <class Side>
+Side kind(const PlacedSide<Side>&);
 
 }  // namespace
 
-FrictionTerm friction_term(
+void make_friction_term(
     const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
-    const ContactFriction& friction) {
-    FrictionTerm term;
-    TermMaker maker(zone, point, zone.contacts[contact], geometry, friction, term);
+    const ContactFriction& friction, FrictionTerm& term) {
     with_placed_sides(
-        zone, zone.contacts[contact], geometry, point.poses, point.nodes,
-        [&](const auto& a, const auto& b) { maker.make(a, b); });
-    term.changes = term.force_of_place;
-    term.slip = term.slip_of_place;
-    term.for_each(
-        [&](int body, int offset) {
-            if (!zone.yields(body)) return;
-            const Mat6 chart = chart_jacobian(point.y.bodies[body]);
-            term.changes.middleCols<6>(offset) = (term.changes.middleCols<6>(offset) * chart).eval();
-            if (term.sticks) term.slip.middleCols<6>(offset) = (term.slip.middleCols<6>(offset) * chart).eval();
-        },
-        [](int, int) {});
-    term.changes += term.force_of_motion;
-    if (term.sticks) term.slip += term.slip_of_motion;
-    return term;
+        zone, zone.contacts[contact], geometry, point.poses, point.nodes, [&](const auto& a, const auto& b) {
+            TermMaker<decltype(kind(a)), decltype(kind(b))>(
+                zone, point, zone.contacts[contact], geometry, friction, term)
+                .make(a, b);
+        });
 }
 
 }  // namespace diffsim

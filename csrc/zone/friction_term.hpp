@@ -7,6 +7,7 @@
 namespace diffsim {
 
 using SlipChanges = Eigen::Matrix<double, 2, Eigen::Dynamic, 0, 2, 18>;
+using TangentRows = Eigen::Matrix<double, Eigen::Dynamic, 2, 0, 18, 2>;
 
 /// Friction of one contact at the solution. Its forces on the coordinates of both sides, Jᵀ λ with λ the force that holds a back,
 /// change with where the sides are and with how they have moved during the step:
@@ -21,7 +22,7 @@ struct FrictionTerm {
     // Along y, with which places move: both together.
     SmallMatrix changes;
     // Sticking: the two tangential directions as forces, and the slip along them.
-    Eigen::Matrix<double, Eigen::Dynamic, 2, 0, 18, 2> rows;
+    TangentRows rows;
     SlipChanges slip_of_place, slip_of_motion, slip;
     Eigen::Matrix2d symmetric;  ///< slipping: the part along the rows that the symmetric matrix of a solver can hold
     double stiffness = 0.0;     ///< of the contact itself [kg]
@@ -34,9 +35,9 @@ struct FrictionTerm {
     }
 };
 
-/// `contact`: index into Zone::contacts.
-FrictionTerm friction_term(
+/// Overwrite a term. `contact`: index into Zone::contacts.
+void make_friction_term(
     const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
-    const ContactFriction& friction);
+    const ContactFriction& friction, FrictionTerm& term);
 
 }  // namespace diffsim

@@ -61,7 +61,9 @@ struct Boxes {
         evaluate(zone, point);
     }
     FrictionTerm term() const {
-        return friction_term(zone, point, point.active.front().index, point.active.front().geometry, state);
+        FrictionTerm term;
+        make_friction_term(zone, point, point.active.front().index, point.active.front().geometry, state, term);
+        return term;
     }
 
     /// The same with a body elsewhere, moved as it was: by a twist at its end.
