@@ -187,7 +187,8 @@ def _backward(*args: Any) -> list[Tensor]:
     call = _call_of(_Settings(*args[:_HEAD]))
     kept = _records.get(int(record))
     call.tape = None if kept is None else kept.tape
-    grads = run_backward(call, needs, as_arrays(tensors))
+    arrays = as_arrays(tensors)
+    grads = run_backward(call, needs, arrays[:INPUT_COUNT], arrays[INPUT_COUNT:])
     wanted = [(t, g) for t, g, needed in zip(tensors, grads, needs) if needed]
     return [torch.zeros(t.shape, dtype=t.dtype) if g is None else g for t, g in wanted]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from . import _core
 from ._check import message
-from ._input_table import INPUT_COUNT, LABELS
+from ._input_table import LABELS
 from ._outcome import gradient_error
 
 OptionalTensors = tuple[Tensor | None, ...]
@@ -38,11 +38,14 @@ class RolloutCall:
     Attributes:
         info: Statistics, after the call.
         tape: What the backward needs, where something requires grad.
+        arrays: The inputs, as the core was given them, where there is a tape: to ask tensors again takes as long as a
+            small backward.
         contacts: What pushed in the last step, arrays by name.
         signature: Hash of each step's active contacts, uint64, shape (steps[, B]).
     """
 
     __slots__ = (
+        "arrays",
         "contacts",
         "controls_have_time",
         "first_step",
@@ -88,6 +91,7 @@ class RolloutCall:
         self.single = single
         self.record = False
         self.tape: _core.Tape | None = None
+        self.arrays: list[Any] | None = None
         self.info: _core.Info | None = None
         self.signature: np.ndarray | None = None  # uint64 hash of the active contacts, shape (steps[, B])
         self.contacts: dict[str, np.ndarray] | None = None  # of the last step, see ContactReadout of the core
@@ -104,28 +108,29 @@ def run_forward(call: RolloutCall, inputs: Sequence[Tensor | None]) -> OptionalT
     if call.want_contacts:
         assert result.tape is not None  # it was recorded
         call.contacts = _core.contacts(result.tape, arrays)
-    call.tape = result.tape if call.record else None
+    if call.record:
+        call.tape, call.arrays = result.tape, arrays
     call.info = result.info
     if call.want_signature:
         call.signature = result.signature
     return tuple([None if a is None else torch.from_numpy(a) for a in result.trajectory])
 
 
-def run_backward(call: RolloutCall, needs: Sequence[bool], arrays: list[Any]) -> OptionalTensors:
+def run_backward(call: RolloutCall, needs: Sequence[bool], inputs: list[Any], upstream: list[Any]) -> OptionalTensors:
     """Gradients with respect to the inputs that need one.
 
     Args:
         call: That of the forward. Without a tape, for checkpointing: the same bits again, recorded this time, and
             dropped after use.
         needs: Of each input.
-        arrays: Of the inputs, then of the gradients of the outputs.
+        inputs: Arrays.
+        upstream: Arrays of the gradients of the outputs.
     """
     if call.options.newton_iterations is not None:
         raise NotImplementedError(
             "diffsim: there are no gradients through newton_iterations: where Newton's method is cut short they"
             " take third derivatives of the elastic energy; leave it at None, or step under torch.no_grad()"
         )
-    inputs, upstream = arrays[:INPUT_COUNT], arrays[INPUT_COUNT:]
     tape = call.tape or _run(call, inputs, record=True).tape
     assert tape is not None  # it was recorded
     limit = _LARGEST_SINGLE if call.single else _LARGEST

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ._core_calls import OptionalTensors, RolloutCall, as_arrays, run_backward, run_forward
 from ._folding import map_backward, map_forward
-from ._input_table import LABELS
+from ._input_table import INPUT_COUNT, LABELS
 
 __all__ = ["RolloutCall", "rollout"]
 
@@ -39,10 +39,18 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        call = _BackwardCall(ctx.call, ctx.needs_input_grad[1:])
+        call, needs = ctx.call, ctx.needs_input_grad[1:]
+        saved = ctx.saved_tensors  # read in any case: that refuses what has been changed in place since
         if torch.is_grad_enabled() or _transforms_active():
-            return None, *_RolloutBackward.apply(call, *ctx.saved_tensors, *grads)
-        return None, *_RolloutBackward.forward(call, *ctx.saved_tensors, *grads)
+            return None, *_RolloutBackward.apply(_BackwardCall(call, needs), *saved, *grads)
+        if call.arrays is not None:
+            try:
+                upstream = as_arrays(grads)
+            except RuntimeError:  # no plain tensors
+                pass
+            else:
+                return None, *run_backward(call, needs, call.arrays, upstream)
+        return None, *_RolloutBackward.forward(_BackwardCall(call, needs), *saved, *grads)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # of a gradient: other tangents show in the inputs, and are refused there
@@ -77,7 +85,7 @@ class _RolloutBackward(torch.autograd.Function):
             if any(t is not None and _is_legacy_batched(t) for t in tensors):
                 return _legacy_rows(backward_call, tensors)
             arrays = as_arrays([t if t is None else t.to_dense() for t in tensors])
-        return run_backward(backward_call.call, backward_call.needs, arrays)
+        return run_backward(backward_call.call, backward_call.needs, arrays[:INPUT_COUNT], arrays[INPUT_COUNT:])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
