@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from _cloth_scenes import DAMPING, DENSITY, POISSON, THICK, YOUNG
 from _contact_scenes import scan
 from _report_flex import MUJOCO_SHEETS
-from _report_motion import LOOSE, SPLIT, SPLIT_ONCE, Motion, ValueScene, at_times, diffsim, rms
+from _report_motion import LOOSE, SPLIT, SPLIT_ONCE, Method, Motion, ValueScene, at_times, diffsim, rms
 
 import diffsim as ds
 
@@ -72,9 +74,25 @@ def body_error(motion: Motion, limit: Motion | None) -> float:
     return rms((motion.states.position[-1] - limit.states.position[-1]).numpy())
 
 
-_SINKS = "MuJoCo's limit is that of its own soft contacts: how deep things sink into the sheet is no error here."
-
 # ---- the table -------------------------------------------------------------------------------------------------------
+
+CLOTH_DTS, CLOTH_LIMIT_DT = (0.02, 0.01, 0.005, 0.0025, 0.00125), 0.0003125
+
+
+def _falls_on_a_sheet(what: str, title: str, make: Callable[[], ds.Scene], methods: tuple[Method, ...]) -> ValueScene:
+    return ValueScene(
+        f"{what}_on_sheet",
+        title,
+        "each simulator's own limit; splits': the monolithic one's",
+        make,
+        0.2,
+        CLOTH_DTS,
+        {"nodes (rms) [m]": nodes_error, f"{what} at the end [m]": body_error},
+        methods,
+        limit_dt=CLOTH_LIMIT_DT,
+        note="MuJoCo's limit is that of its own soft contacts: how deep things sink into the sheet is no error here.",
+    )
+
 
 CLOTH = (
     ValueScene(
@@ -83,35 +101,18 @@ CLOTH = (
         "each simulator's own limit",
         swinging_sheet,
         0.4,
-        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        CLOTH_DTS,
         {"nodes (rms) [m]": nodes_error},
         (diffsim(), LOOSE, SPLIT_ONCE, *MUJOCO_SHEETS),
-        limit_dt=0.0003125,
+        limit_dt=CLOTH_LIMIT_DT,
         quick=True,
     ),
-    ValueScene(
-        "ball_on_sheet",
-        "A ball falls on a sheet",
-        "each simulator's own limit; splits': the monolithic one's",
-        ball_on_sheet,
-        0.2,
-        (0.02, 0.01, 0.005, 0.0025, 0.00125),
-        {"nodes (rms) [m]": nodes_error, "ball at the end [m]": body_error},
-        (diffsim(), SPLIT, SPLIT_ONCE, *MUJOCO_SHEETS),
-        limit_dt=0.0003125,
-        note=_SINKS,
-    ),
-    ValueScene(
-        "figurine_on_sheet",
+    _falls_on_a_sheet("ball", "A ball falls on a sheet", ball_on_sheet, (diffsim(), SPLIT, SPLIT_ONCE, *MUJOCO_SHEETS)),
+    _falls_on_a_sheet(
+        "figurine",
         "A figurine falls on a sheet (MuJoCo: its convex hull)",
-        "each simulator's own limit; splits': the monolithic one's",
         figurine_on_sheet,
-        0.2,
-        (0.02, 0.01, 0.005, 0.0025, 0.00125),
-        {"nodes (rms) [m]": nodes_error, "figurine at the end [m]": body_error},
         (diffsim(), SPLIT, SPLIT_ONCE, MUJOCO_SHEETS[0]),
-        limit_dt=0.0003125,
-        note=_SINKS,
     ),
     ValueScene(
         "drape",
@@ -119,9 +120,9 @@ CLOTH = (
         "each simulator's own limit, and no depth",
         draped,
         0.3,
-        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        CLOTH_DTS,
         {"nodes (rms) [m]": nodes_error, "deepest penetration of a node [m]": in_the_ball},
         (diffsim(), LOOSE, SPLIT, *MUJOCO_SHEETS),
-        limit_dt=0.0003125,
+        limit_dt=CLOTH_LIMIT_DT,
     ),
 )

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 from _mujoco import Settings
-from _report_cloth import draped, in_the_ball, nodes_error
+from _report_cloth import CLOTH_DTS, CLOTH_LIMIT_DT, draped, in_the_ball, nodes_error
 from _report_flex import MUJOCO_SHEETS
 from _report_impacts import creep
 from _report_motion import LOOSE, TENTHS, TRAPEZOIDAL, G, Motion, ValueScene, diffsim, mujoco_bodies, penetration, rms
@@ -314,9 +314,9 @@ FRICTION = (
         "each simulator's own limit, and no depth",
         draped_with_friction,
         0.3,
-        (0.02, 0.01, 0.005, 0.0025, 0.00125),
+        CLOTH_DTS,
         {"nodes (rms) [m]": nodes_error, "deepest penetration of a node [m]": in_the_ball},
         (diffsim(), LOOSE, *MUJOCO_SHEETS),
-        limit_dt=0.0003125,
+        limit_dt=CLOTH_LIMIT_DT,
     ),
 )

@@ -5,6 +5,9 @@ from importlib.util import find_spec
 
 import pytest
 import torch
+from small_scenes import make_scene
+
+import diffsim as ds
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -24,6 +27,18 @@ if find_spec("hypothesis"):
     settings.register_profile("quick", max_examples=25, deadline=None, derandomize=True, database=None)
     settings.register_profile("long", max_examples=2000, deadline=None)
     settings.load_profile("quick")
+
+
+@pytest.fixture
+def sim() -> ds.Simulator:
+    """A box and a ball in free flight."""
+    return ds.Simulator(make_scene(), dt=0.01)
+
+
+@pytest.fixture
+def state(sim: ds.Simulator) -> ds.State:
+    """Where the file's `sim` starts."""
+    return sim.initial_state()
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Two small scenes that the tests of the simulator share, and how states are compared there."""
+"""Small scenes that tests of the layer share, and how states are compared there."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any
 import torch
 
 import diffsim as ds
+from diffsim.scene import PackedScene
 
 STATE_FIELDS = ("position", "orientation", "velocity", "angular_velocity")
 BOX = (1.0, 0.7, 0.4)
+CUBE = ds.shapes.box(1.0)
 # Sums of a few terms of order one, in another order.
 ROUNDING = 1e-12
 # The same where contact, stiff as it is, multiplies what rounding leaves.
@@ -31,6 +33,18 @@ def make_scene() -> ds.Scene:
     return scene
 
 
+def one_body(**arguments: Any) -> PackedScene:
+    """A scene's arrays: of a cube of 1000 kg, unless the arguments of `add_body` say otherwise."""
+    scene = ds.Scene()
+    scene.add_body(arguments.pop("mesh", CUBE), **{"density": 1000.0, **arguments})
+    return scene.pack()
+
+
+def open_box() -> ds.shapes.Mesh:
+    vertices, faces = CUBE
+    return vertices, faces[2:]
+
+
 def falling_box(**options: Any) -> ds.Simulator:
     """A tilted box about to hit the ground."""
     scene = ds.Scene()
@@ -39,6 +53,20 @@ def falling_box(**options: Any) -> ds.Simulator:
         ds.shapes.box(BOX), density=2.0, position=(0, 0, 0.6), orientation=(1, 0.3, 0.1, 0), velocity=(0, 0, -5)
     )
     return ds.Simulator(scene, dt=0.01, **options)
+
+
+def landing_box() -> ds.Simulator:
+    """A tilted box that lands on the ground in its third step."""
+    scene = ds.Scene()
+    scene.add_ground()
+    scene.add_body(
+        ds.shapes.box(BOX),
+        density=2.0,
+        position=(0, 0, 0.5),
+        orientation=(1, 0.3, 0.1, 0),
+        velocity=(1, 0, -3),
+    )
+    return ds.Simulator(scene, dt=0.01)
 
 
 def assert_same(a: ds.State, b: ds.State) -> None:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
-from test_ops import box_on_ground, two_bodies
+from small_scenes import landing_box
+from test_ops import two_bodies
 from torch import Tensor
 
 import diffsim as ds
@@ -18,7 +19,7 @@ def end_of(sim: ds.Simulator, steps: int, every: int | None = None) -> Callable[
     return lambda v: sim.rollout(state.replace(velocity=v), None, steps, checkpoint_every=every).position[-1]
 
 
-@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+@pytest.mark.parametrize("make", [two_bodies, landing_box])
 @pytest.mark.parametrize("every", [None, 2])
 def test_batched_upstream_gradients_give_the_jacobian(make: Callable[[], ds.Simulator], every: int | None) -> None:
     sim = make()

@@ -25,11 +25,6 @@ def sim() -> ds.Simulator:
     return ds.Simulator(make_scene(), dt=0.01)
 
 
-@pytest.fixture
-def state(sim: ds.Simulator) -> ds.State:
-    return sim.initial_state()
-
-
 def test_parameters_are_those_of_the_materials(sim: ds.Simulator) -> None:
     denim, cotton = ds.ClothMaterial.denim(), ds.ClothMaterial()
     for name in CLOTH_PARAMETERS:

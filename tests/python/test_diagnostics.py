@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 import torch
-from small_scenes import only_read
+from small_scenes import landing_box, only_read
 
 import diffsim as ds
 from diffsim import _core
@@ -33,16 +33,7 @@ def test_passes_in_free_flight(sim: ds.Simulator) -> None:
 
 
 def test_passes_in_contact() -> None:
-    scene = ds.Scene()
-    scene.add_ground()
-    scene.add_body(
-        ds.shapes.box((1.0, 0.7, 0.4)),
-        density=2.0,
-        position=(0, 0, 0.5),
-        orientation=(1, 0.3, 0.1, 0),
-        velocity=(1, 0, -3),
-    )
-    sim = ds.Simulator(scene, dt=0.01)
+    sim = landing_box()
     report = gradcheck(sim, sim.initial_state(), steps=20)
     assert sim.info is not None
     assert sim.info.contacts > 0

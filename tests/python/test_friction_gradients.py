@@ -62,37 +62,27 @@ def box_on_a_turntable(scene: ds.Scene) -> None:
     scene.add_body(box, density=1000.0, position=(1.0, 0.0, 0.4004), velocity=(0.1, 0.4, 0.0), friction=0.4)
 
 
+SHEET = ds.ClothMaterial.isotropic(young=1e5, thickness=2e-3, density=300.0, poisson=0.3, damping=1e-3)
+
+
+def add_held_sheet(scene: ds.Scene) -> None:
+    scene.add_cloth(ds.shapes.sheet(0.6, 5), SHEET, pinned=[0, 4, 20, 24], position=(0.0, 0.0, 0.5), friction=0.5)
+
+
 def sheet_on_a_box(scene: ds.Scene) -> None:
     scene.add_body(ds.shapes.box((0.4, 0.4, 0.3)), kind="static", position=(0, 0, 0.15), friction=0.4)
-    scene.add_cloth(
-        ds.shapes.sheet(0.6, 5),
-        ds.ClothMaterial.isotropic(young=1e5, thickness=2e-3, density=300.0, poisson=0.3, damping=1e-3),
-        position=(0.08, 0.03, 0.31),
-        velocity=(0.5, 0.1, 0.0),
-        friction=0.3,
-    )
+    motion: dict[str, Any] = {"position": (0.08, 0.03, 0.31), "velocity": (0.5, 0.1, 0.0)}
+    scene.add_cloth(ds.shapes.sheet(0.6, 5), SHEET, friction=0.3, **motion)
 
 
 def ball_on_a_sheet(scene: ds.Scene) -> None:
-    scene.add_cloth(
-        ds.shapes.sheet(0.6, 5),
-        ds.ClothMaterial.isotropic(young=1e5, thickness=2e-3, density=300.0, poisson=0.3, damping=1e-3),
-        pinned=[0, 4, 20, 24],
-        position=(0.0, 0.0, 0.5),
-        friction=0.5,
-    )
+    add_held_sheet(scene)
     motion: dict[str, Any] = {"velocity": (0.6, 0.2, -0.5), "angular_velocity": (1.0, 0.0, 2.0)}
     scene.add_sphere(0.08, density=300.0, position=(-0.07, 0.02, 0.59), friction=0.4, **motion)
 
 
 def figurine_on_a_sheet(scene: ds.Scene) -> None:
-    scene.add_cloth(
-        ds.shapes.sheet(0.6, 5),
-        ds.ClothMaterial.isotropic(young=1e5, thickness=2e-3, density=300.0, poisson=0.3, damping=1e-3),
-        pinned=[0, 4, 20, 24],
-        position=(0.0, 0.0, 0.5),
-        friction=0.5,
-    )
+    add_held_sheet(scene)
     vertices, faces = ds.shapes.icosphere(0.1, 1)
     vertices *= 1.0 + 0.3 * np.cos(40.0 * vertices.sum(axis=1, keepdims=True))  # bumps and hollows
     motion: dict[str, Any] = {"velocity": (0.6, 0.2, -0.5), "angular_velocity": (1.0, 0.0, 2.0)}

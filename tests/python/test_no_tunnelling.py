@@ -44,14 +44,19 @@ def thrown(speed: float, rpy: tuple[float, float, float], spin: float, oblique: 
     return scene
 
 
-def assert_stays_above(scene: ds.Scene, speed: float) -> ds.State:
+def rolled_out(scene: ds.Scene) -> tuple[ds.Simulator, ds.State, ds.State]:
+    """The simulator, the state at the start, and 20 steps."""
     sim = ds.Simulator(scene, dt=0.01)
     state = sim.initial_state()
     with warnings.catch_warnings():
         # A step that gives up must be safe, too: what is judged here is where things are.
         warnings.simplefilter("ignore", ds.ConvergenceWarning)
         warnings.simplefilter("ignore", ds.FastImpactWarning)
-        trajectory = sim.rollout(state, None, 20)
+        return sim, state, sim.rollout(state, None, 20)
+
+
+def assert_stays_above(scene: ds.Scene, speed: float) -> ds.State:
+    sim, state, trajectory = rolled_out(scene)
     check = PenetrationCheck(scene, sim.thickness)
     for step, frame in enumerate(trajectory):
         assert check.problems(sim, frame) == [], step
@@ -99,12 +104,7 @@ def test_two_free_boxes_do_not_pass_through_each_other(speed: float) -> None:
             orientation=rotation.from_rpy(np.array(rpy)),
             velocity=(-side * 0.5 * speed, 0.0, 0.0),
         )
-    sim = ds.Simulator(scene, dt=0.01)
-    state = sim.initial_state()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ds.ConvergenceWarning)
-        warnings.simplefilter("ignore", ds.FastImpactWarning)
-        trajectory = sim.rollout(state, None, 20)
+    sim, state, trajectory = rolled_out(scene)
     check = PenetrationCheck(scene, sim.thickness)
     for frame in trajectory:
         assert check.problems(sim, frame) == []

@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.utils._pytree as pytree
-from small_scenes import only_read
+from small_scenes import landing_box, only_read
 from torch import Tensor
 from torch.func import functional_call, grad, jacrev, vjp, vmap
 
@@ -25,20 +25,6 @@ def two_bodies() -> ds.Simulator:
     scene = ds.Scene()
     scene.add_body(ds.shapes.box((1.0, 0.7, 0.4)), density=2.0, position=(0, 0, 5), angular_velocity=(1.0, -2.0, 0.5))
     scene.add_body(ds.shapes.box(1.0), kind="kinematic", position=(9, 0, 5), velocity=(0, 1, 0))
-    return ds.Simulator(scene, dt=0.01)
-
-
-def box_on_ground() -> ds.Simulator:
-    """A tilted box that lands on the ground in its third step."""
-    scene = ds.Scene()
-    scene.add_ground()
-    scene.add_body(
-        ds.shapes.box((1.0, 0.7, 0.4)),
-        density=2.0,
-        position=(0, 0, 0.5),
-        orientation=(1, 0.3, 0.1, 0),
-        velocity=(1, 0, -3),
-    )
     return ds.Simulator(scene, dt=0.01)
 
 
@@ -102,7 +88,7 @@ def close(a: Tensor, b: Tensor) -> bool:
     return bool((a - b).abs().max() <= ROUNDING * (1 + b.abs().max()))
 
 
-@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+@pytest.mark.parametrize("make", [two_bodies, landing_box])
 @pytest.mark.parametrize("keep_time", [False, True])
 def test_gradcheck(make: Callable[[], ds.Simulator], keep_time: bool) -> None:
     sim = make()
@@ -265,7 +251,7 @@ def different_states(sim: ds.Simulator, *leading: int) -> ds.State:
     return ds.State(*full).replace(velocity=state.velocity + spread)
 
 
-@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+@pytest.mark.parametrize("make", [two_bodies, landing_box])
 def test_batch_equals_single_runs(make: Callable[[], ds.Simulator]) -> None:
     sim = make()
     states = different_states(sim, 3)
@@ -282,7 +268,7 @@ def test_batch_equals_single_runs(make: Callable[[], ds.Simulator]) -> None:
         assert expected.any()
 
 
-@pytest.mark.parametrize("make", [two_bodies, box_on_ground])
+@pytest.mark.parametrize("make", [two_bodies, landing_box])
 def test_vmap_equals_the_native_batch(make: Callable[[], ds.Simulator], calls: Calls) -> None:
     sim = make()
     states = different_states(sim, 3)

@@ -9,17 +9,6 @@ from torch import Tensor
 import diffsim as ds
 from diffsim import _core
 
-
-@pytest.fixture
-def sim() -> ds.Simulator:
-    return ds.Simulator(make_scene(), dt=0.01)
-
-
-@pytest.fixture
-def state(sim: ds.Simulator) -> ds.State:
-    return sim.initial_state()
-
-
 # ---- rollout ---------------------------------------------------------------------------------------------------------
 
 

@@ -15,17 +15,6 @@ from torch.func import functional_call
 import diffsim as ds
 from diffsim import _outcome
 
-
-@pytest.fixture
-def sim() -> ds.Simulator:
-    return ds.Simulator(make_scene(), dt=0.01)
-
-
-@pytest.fixture
-def state(sim: ds.Simulator) -> ds.State:
-    return sim.initial_state()
-
-
 # ---- construction ----------------------------------------------------------------------------------------------------
 
 
