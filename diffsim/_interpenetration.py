@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,7 @@ _DEPTH_SAMPLES = 48
 _MOST_PROJECTIONS = 20_000_000
 
 
-@dataclass(frozen=True)
-class Overlap:
+class Overlap(NamedTuple):
     """Two solids, by index, that interpenetrate; `b` may be `GROUND`."""
 
     a: int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ IntArray = NDArray[np.int32]
 _ROUNDING = 16.0 * np.finfo(np.float64).eps  # relative, of sums over faces
 
 
-@dataclass(frozen=True, eq=False)
-class MassProperties:
+class MassProperties(NamedTuple):
     """Of a solid of density 1 kg/m³; all three scale linearly with the density."""
 
     mass: float  #: the volume; negative when the faces point inwards  [m³ · 1 kg/m³]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,7 @@ _FLAT_VOLUME = 1e-12
 _CLOSED_MEND = "remove such faces (trimesh: mesh.update_faces(mesh.nondegenerate_faces())) and close the mesh again"
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeDefects:
+class EdgeDefects(NamedTuple):
     """What keeps a mesh from enclosing a volume."""
 
     open_count: int  #: edges that bound an odd number of faces

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,8 +189,7 @@ def meeting_faces(a: Solid, b: Solid) -> NDArray[np.int64]:
     return np.stack([key // len(b.faces), key % len(b.faces)], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Crossing:
+class Crossing(NamedTuple):
     """Pairs of triangles, and whether they properly cross: along a piece of line, each reaching through the other."""
 
     proper: NDArray[np.bool_]  #: shape (k,)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +96,7 @@ def _row_numbers(rows: NDArray[Any]) -> NDArray[np.int64]:
 # ---- Parts ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """Faces connected by edges: closed, since all faces at an edge are of one part."""
 
     solid: Solid
