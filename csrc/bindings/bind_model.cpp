@@ -191,27 +191,7 @@ std::vector<std::string> object_names(const Model& model) {
     return names;
 }
 
-}  // namespace
-
-void bind_model(py::module_& module) {
-    py::class_<Model, std::shared_ptr<Model>>(module, "Model", "Bodies, cloths, their collision meshes and the ground.")
-        .def(
-            py::init(&make_model), py::kw_only(), py::arg("names"), py::arg("kind").noconvert(),
-            py::arg("margin").noconvert(), py::arg("vertex_count").noconvert(), py::arg("vertices").noconvert(),
-            py::arg("face_count").noconvert(), py::arg("faces").noconvert(), py::arg("has_ground"),
-            py::arg("ground_height"), py::arg("ground_margin"), py::arg("thickness").noconvert(),
-            py::arg("cloth_names"), py::arg("cloth_margin").noconvert(), py::arg("cloth_poisson").noconvert(),
-            py::arg("node_count").noconvert(), py::arg("triangle_count").noconvert(), py::arg("triangles").noconvert(),
-            py::arg("node_rest").noconvert(), py::arg("warp").noconvert(), py::arg("pinned").noconvert())
-        .def_property_readonly("names", &object_names)
-        .def_property_readonly("body_count", &Model::body_count)
-        .def_property_readonly("cloth_count", &Model::cloth_count)
-        .def_property_readonly("node_count", &Model::node_count)
-        .def(
-            "hinges", &hinges,
-            "Of all cloths: nodes, angles at rest and weights of the hinges, pairs of coupled hinges and their "
-            "weights.");
-
+void bind_options(py::module_& module) {
     const Options defaults;
     py::class_<Options>(module, "Options", "How steps are taken.")
         .def(
@@ -255,6 +235,29 @@ void bind_model(py::module_& module) {
         .def_property(
             "integrator", [](const Options& options) { return integrator_text(options.integrator); },
             [](Options& options, const std::string& text) { options.integrator = parse_integrator(text); });
+}
+
+}  // namespace
+
+void bind_model(py::module_& module) {
+    py::class_<Model, std::shared_ptr<Model>>(module, "Model", "Bodies, cloths, their collision meshes and the ground.")
+        .def(
+            py::init(&make_model), py::kw_only(), py::arg("names"), py::arg("kind").noconvert(),
+            py::arg("margin").noconvert(), py::arg("vertex_count").noconvert(), py::arg("vertices").noconvert(),
+            py::arg("face_count").noconvert(), py::arg("faces").noconvert(), py::arg("has_ground"),
+            py::arg("ground_height"), py::arg("ground_margin"), py::arg("thickness").noconvert(),
+            py::arg("cloth_names"), py::arg("cloth_margin").noconvert(), py::arg("cloth_poisson").noconvert(),
+            py::arg("node_count").noconvert(), py::arg("triangle_count").noconvert(), py::arg("triangles").noconvert(),
+            py::arg("node_rest").noconvert(), py::arg("warp").noconvert(), py::arg("pinned").noconvert())
+        .def_property_readonly("names", &object_names)
+        .def_property_readonly("body_count", &Model::body_count)
+        .def_property_readonly("cloth_count", &Model::cloth_count)
+        .def_property_readonly("node_count", &Model::node_count)
+        .def(
+            "hinges", &hinges,
+            "Of all cloths: nodes, angles at rest and weights of the hinges, pairs of coupled hinges and their "
+            "weights.");
+    bind_options(module);
 }
 
 }  // namespace diffsim::bindings

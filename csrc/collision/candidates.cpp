@@ -83,19 +83,22 @@ void pair_cells(
     }
 }
 
-/// Calls visit_cells(cell_a, cell_b) for all pairs of cells whose swept boxes overlap.
-template <typename VisitCells>
+/// Down two trees at once: calls visit_cells(cell_a, cell_b) for all pairs of cells below two nodes whose swept boxes
+/// overlap. `box_a(node)`, `box_b(node)`: swept.
+template <typename BoxA, typename BoxB, typename VisitCells>
 struct TreePairing {
-    const SweptBoxes& a;
-    const SweptBoxes& b;
+    const SweptMesh& a;
+    const SweptMesh& b;
+    const BoxA& box_a;
+    const BoxB& box_b;
     const VisitCells& visit_cells;
 
-    void visit(int node_a, int node_b) {
-        if (!a.node(node_a).overlaps(b.node(node_b))) return;
-        const BoxTree::Node& na = tree_of(a.swept()).nodes[node_a];
-        const BoxTree::Node& nb = tree_of(b.swept()).nodes[node_b];
+    void visit(int node_a, int node_b) const {
+        if (!box_a(node_a).overlaps(box_b(node_b))) return;
+        const BoxTree::Node& na = tree_of(a).nodes[node_a];
+        const BoxTree::Node& nb = tree_of(b).nodes[node_b];
         if (na.is_leaf() && nb.is_leaf()) {
-            visit_cells(a.swept().mesh->cells[na.item], b.swept().mesh->cells[nb.item]);
+            visit_cells(a.mesh->cells[na.item], b.mesh->cells[nb.item]);
         } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
             visit(na.left, node_b);
             visit(na.right, node_b);
@@ -106,45 +109,34 @@ struct TreePairing {
     }
 };
 
+/// Calls visit_cells(cell_a, cell_b) for all pairs of cells whose swept boxes overlap.
 template <typename VisitCells>
 void for_each_cell_pair(const SweptBoxes& a, const SweptBoxes& b, const VisitCells& visit_cells) {
     if (a.swept().mesh->tree.empty() || b.swept().mesh->tree.empty()) return;
-    TreePairing<VisitCells>{a, b, visit_cells}.visit(0, 0);
+    const auto box_a = [&](int node) -> const Box& { return a.node(node); };
+    const auto box_b = [&](int node) -> const Box& { return b.node(node); };
+    TreePairing<decltype(box_a), decltype(box_b), VisitCells>{a.swept(), b.swept(), box_a, box_b, visit_cells}.visit(
+        0, 0);
 }
 
-/// Calls visit_cells(cell_a, cell_b) for all pairs of different cells of one mesh whose swept boxes overlap.
-template <typename VisitCells>
-struct SelfPairing {
-    const SweptMesh& swept;
-    const std::vector<BoxTree::Node>& nodes;
-    const VisitCells& visit_cells;
+/// All pairs of different cells below a node.
+template <typename Pairing>
+void visit_own_pairs(const Pairing& pairing, const BoxTree& tree, int node) {
+    const BoxTree::Node& n = tree.nodes[node];
+    if (n.is_leaf()) return;  // the features of one cell share vertices
+    visit_own_pairs(pairing, tree, n.left);
+    visit_own_pairs(pairing, tree, n.right);
+    pairing.visit(n.left, n.right);
+}
 
-    void visit(int node) {
-        const BoxTree::Node& n = nodes[node];
-        if (n.is_leaf()) return;  // the features of one cell share vertices
-        visit(n.left);
-        visit(n.right);
-        visit(n.left, n.right);
-    }
-    void visit(int node_a, int node_b) {
-        const BoxTree::Node &na = nodes[node_a], &nb = nodes[node_b];
-        if (!na.box.overlaps(nb.box)) return;
-        if (na.is_leaf() && nb.is_leaf()) {
-            visit_cells(swept.mesh->cells[na.item], swept.mesh->cells[nb.item]);
-        } else if (nb.is_leaf() || (!na.is_leaf() && na.box.half_extent().sum() >= nb.box.half_extent().sum())) {
-            visit(na.left, node_b);
-            visit(na.right, node_b);
-        } else {
-            visit(node_a, nb.left);
-            visit(node_a, nb.right);
-        }
-    }
-};
-
+/// The same of different cells of one mesh, whose tree is of swept boxes.
 template <typename VisitCells>
 void for_each_own_cell_pair(const SweptMesh& swept, const VisitCells& visit_cells) {
     const BoxTree& tree = tree_of(swept);
-    if (!tree.empty()) SelfPairing<VisitCells>{swept, tree.nodes, visit_cells}.visit(0);
+    if (tree.empty()) return;
+    const auto box = [&](int node) -> const Box& { return tree.nodes[node].box; };
+    visit_own_pairs(
+        TreePairing<decltype(box), decltype(box), VisitCells>{swept, swept, box, box, visit_cells}, tree, 0);
 }
 
 bool has_vertex(const Patch& patch, int vertex) {

@@ -95,14 +95,25 @@ double elimination_cost(int width, int below) {
            kPerUpdateTile * update_tiles;
 }
 
-/// Columns of the same pattern, then merged with their parents as long as that saves time.
-Supernodes merge_columns(
+/// Columns that follow each other in a postorder and have the same pattern, by groups.
+struct ColumnGroups {
+    std::vector<int> columns;       ///< in postorder
+    std::vector<int> first, last;   ///< per group: into the columns
+    std::vector<int> width, below;  ///< scalar columns, and scalar rows below them
+    std::vector<int> parent;        ///< -1: none
+
+    int count() const { return static_cast<int>(first.size()); }
+};
+
+ColumnGroups group_columns(
     const std::vector<Column>& tree, const std::vector<int>& order, const std::vector<int>& sizes) {
     const int count = static_cast<int>(order.size());
     std::vector<int> column_parent(order.size());
     for (int i = 0; i < count; ++i) column_parent[i] = tree[i].parent;
-    const std::vector<int> columns = postorder(column_parent);
-    std::vector<int> group_of(order.size()), first, last, width, below;
+    ColumnGroups groups;
+    groups.columns = postorder(column_parent);
+    auto& [columns, first, last, width, below, parent] = groups;
+    std::vector<int> group_of(order.size());
     for (int k = 0; k < count; ++k) {
         const int column = columns[k], size = sizes[order[column]];
         const bool joins =
@@ -116,20 +127,25 @@ Supernodes merge_columns(
         last.back() = k;
         width.back() += size;
         below.back() = tree[column].below;
-        group_of[column] = static_cast<int>(first.size()) - 1;
+        group_of[column] = groups.count() - 1;
     }
-
-    const int group_count = static_cast<int>(first.size());
-    std::vector<int> parent(first.size(), -1), merged_into(first.size(), -1);
-    ItemLists children(first.size());
-    for (int g = group_count - 1; g >= 0; --g) {
+    parent.assign(first.size(), -1);
+    for (int g = 0; g < groups.count(); ++g) {
         const int above = column_parent[columns[last[g]]];
-        if (above < 0) continue;
-        parent[g] = group_of[above];
-        children.push_front(parent[g], g);
+        if (above >= 0) parent[g] = group_of[above];
     }
+    return groups;
+}
+
+/// What each group is merged into, as long as that saves time; -1: nothing. Widths grow by what is merged into them.
+std::vector<int> merge_into_parents(ColumnGroups& groups) {
+    auto& [columns, first, last, width, below, parent] = groups;
+    std::vector<int> merged_into(first.size(), -1);
+    ItemLists children(first.size());
+    for (int g = groups.count() - 1; g >= 0; --g)
+        if (parent[g] >= 0) children.push_front(parent[g], g);
     std::vector<double> cost(first.size());
-    for (int g = 0; g < group_count; ++g) {
+    for (int g = 0; g < groups.count(); ++g) {
         cost[g] = elimination_cost(width[g], below[g]);
         for (int child = children.head[g]; child >= 0; child = children.next[child]) {
             const double together = elimination_cost(width[g] + width[child], below[g]);
@@ -139,11 +155,20 @@ Supernodes merge_columns(
             merged_into[child] = g;
         }
     }
+    return merged_into;
+}
+
+/// Columns of the same pattern, then merged with their parents as long as that saves time.
+Supernodes merge_columns(
+    const std::vector<Column>& tree, const std::vector<int>& order, const std::vector<int>& sizes) {
+    ColumnGroups groups = group_columns(tree, order, sizes);
+    const std::vector<int> merged_into = merge_into_parents(groups);
+    const auto& [columns, first, last, width, below, parent] = groups;
 
     // Parents come later than their children, so that going down finds them merged already.
     ItemLists members(first.size());
     std::vector<int> keeper(first.size()), kept_parent(first.size(), kNotANode);
-    for (int g = group_count - 1; g >= 0; --g) {
+    for (int g = groups.count() - 1; g >= 0; --g) {
         keeper[g] = merged_into[g] < 0 ? g : keeper[merged_into[g]];
         members.push_front(keeper[g], g);
         if (keeper[g] == g) kept_parent[g] = parent[g] < 0 ? -1 : keeper[parent[g]];

@@ -12,6 +12,21 @@ int to_offsets(std::vector<int>& sizes) {
     return sum;
 }
 
+bool yields(const Model& model, int object) {
+    return object >= 0 && (model.is_cloth(object) || model.bodies[object].is_dynamic());
+}
+
+/// The object by which a contact's zone is found.
+int yielding_object(const Model& model, const Contact& contact) {
+    return yields(model, contact.object_a) ? contact.object_a : contact.object_b;
+}
+
+template <class Visit>
+void for_each_contact(const std::vector<ContactList>& lists, const Visit& visit) {
+    for (const ContactList& list : lists)
+        for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list, k);
+}
+
 }  // namespace
 
 std::size_t TouchingZones::bytes() const {
@@ -22,34 +37,28 @@ std::size_t TouchingZones::bytes() const {
                sizeof(int);
 }
 
-void ZoneFinder::find(
-    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, const Wanted& wanted,
-    TouchingZones& zones) {
+void ZoneFinder::unite(
+    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool one_zone) {
     const int object_count = model.body_count() + model.cloth_count();
-    const auto yields = [&](int object) {
-        return object >= 0 && (model.is_cloth(object) || model.bodies[object].is_dynamic());
-    };
-    const auto for_each_contact = [&](const auto& visit) {
-        for (const ContactList& list : lists)
-            for (int k = 0; k < list.count; ++k) visit(list.contacts[k], list, k);
-    };
-
     m_touching.reset(object_count);
     m_zone_of.assign(static_cast<std::size_t>(object_count), -1);
     for (int c = model.body_count(); c < object_count; ++c) m_zone_of[c] = 0;
-    if (wanted.one_zone) {
+    if (one_zone) {
         for (int i : movers) {
             m_zone_of[i] = 0;
             m_touching.unite(movers[0], i);
         }
     }
-    for_each_contact([&](const Contact& c, const ContactList&, int) {
-        if (yields(c.object_a)) m_zone_of[c.object_a] = 0;
-        if (yields(c.object_b)) m_zone_of[c.object_b] = 0;
-        if (yields(c.object_a) && yields(c.object_b)) m_touching.unite(c.object_a, c.object_b);
+    for_each_contact(lists, [&](const Contact& c, const ContactList&, int) {
+        const bool a_yields = yields(model, c.object_a), b_yields = yields(model, c.object_b);
+        if (a_yields) m_zone_of[c.object_a] = 0;
+        if (b_yields) m_zone_of[c.object_b] = 0;
+        if (a_yields && b_yields) m_touching.unite(c.object_a, c.object_b);
     });
+}
 
-    // Number the zones by their smallest objects, then sort objects and contacts by zone.
+/// By their smallest objects; how many bodies and cloths each has stands at their ends.
+void ZoneFinder::number(const Model& model, const std::vector<int>& movers, TouchingZones& zones) {
     zones.body_end.clear();
     zones.cloth_end.clear();
     for (int i : movers) {
@@ -64,11 +73,18 @@ void ZoneFinder::find(
         }
         ++(model.is_cloth(i) ? zones.cloth_end : zones.body_end)[m_zone_of[i]];
     }
+}
+
+void ZoneFinder::find(
+    const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, const Wanted& wanted,
+    TouchingZones& zones) {
+    unite(model, movers, lists, wanted.one_zone);
+    number(model, movers, zones);
+    // Objects and contacts, sorted by zone.
     zones.contact_end.assign(zones.body_end.size(), 0);
-    const auto zone_of_contact = [&](const Contact& c) {
-        return m_zone_of[yields(c.object_a) ? c.object_a : c.object_b];
-    };
-    for_each_contact([&](const Contact& c, const ContactList&, int) { ++zones.contact_end[zone_of_contact(c)]; });
+    for_each_contact(lists, [&](const Contact& c, const ContactList&, int) {
+        ++zones.contact_end[m_zone_of[yielding_object(model, c)]];
+    });
     zones.bodies.resize(static_cast<std::size_t>(to_offsets(zones.body_end)));
     zones.cloths.resize(static_cast<std::size_t>(to_offsets(zones.cloth_end)));
     zones.contacts.resize(static_cast<std::size_t>(to_offsets(zones.contact_end)));
@@ -81,8 +97,8 @@ void ZoneFinder::find(
             zones.bodies[zones.body_end[m_zone_of[i]]++] = i;
     }
     zones.friction.resize(wanted.friction ? zones.contacts.size() : 0);
-    for_each_contact([&](const Contact& c, const ContactList& list, int k) {
-        const int slot = zones.contact_end[zone_of_contact(c)]++;
+    for_each_contact(lists, [&](const Contact& c, const ContactList& list, int k) {
+        const int slot = zones.contact_end[m_zone_of[yielding_object(model, c)]]++;
         zones.contacts[slot] = c;
         if (wanted.exact) zones.exact[slot] = list.exact[k];
         if (wanted.friction) zones.friction[slot] = list.friction[k];

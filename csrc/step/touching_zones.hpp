@@ -45,6 +45,10 @@ public:
         TouchingZones& zones);
 
 private:
+    void unite(
+        const Model& model, const std::vector<int>& movers, const std::vector<ContactList>& lists, bool one_zone);
+    void number(const Model& model, const std::vector<int>& movers, TouchingZones& zones);
+
     UnionFind m_touching;
     std::vector<int> m_zone_of;  // per object, -1 in none
 };
