@@ -91,6 +91,22 @@ void add_rows(
     });
 }
 
+namespace {
+
+void set_pushes(ModelWorkspace& w) {
+    w.pushes.resize(w.violation.size());
+    for (std::size_t r = 0; r < w.pushes.size(); ++r) w.pushes[r] = w.violation[r] > 0.0;
+}
+
+/// Those that pushed in the model before, where any did.
+void guess_pushes(const std::vector<ContactRow>& rows, ModelWorkspace& w) {
+    set_pushes(w);
+    if (std::none_of(rows.begin(), rows.end(), [](const ContactRow& row) { return row.force > 0.0; })) return;
+    for (std::size_t r = 0; r < rows.size(); ++r) w.pushes[r] = rows[r].force > 0.0;
+}
+
+}  // namespace
+
 ModelSolution minimise(
     ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& w, Coordinates& p) {
     ModelSolution result;
@@ -100,15 +116,7 @@ ModelSolution minimise(
     model.smooth.multiply(p, w.smooth_p);
     rows_times(rows, p, w.violation);
     for (std::size_t r = 0; r < count; ++r) w.violation[r] = rows[r].missing - w.violation[r];
-    const auto set_pushes = [&] {
-        w.pushes.resize(count);
-        for (std::size_t r = 0; r < count; ++r) w.pushes[r] = w.violation[r] > 0.0;
-    };
-    set_pushes();
-    bool guessed = false;
-    for (std::size_t r = 0; r < count && !guessed; ++r) guessed = rows[r].force > 0.0;
-    if (guessed)
-        for (std::size_t r = 0; r < count; ++r) w.pushes[r] = rows[r].force > 0.0;
+    guess_pushes(rows, w);
     int full_steps = 0;
     while (result.newton_steps < kMaxNewtonSteps) {
         system.copy_values(model.smooth);
@@ -148,7 +156,7 @@ ModelSolution minimise(
             result.status = ModelSolution::Status::solved;
             break;
         }
-        set_pushes();
+        set_pushes(w);
     }
     if (result.status != ModelSolution::Status::solved) result.status = ModelSolution::Status::crawling;
     for (std::size_t r = 0; r < count; ++r) rows[r].force = share * rows[r].stiffness * std::max(0.0, w.violation[r]);

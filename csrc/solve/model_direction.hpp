@@ -83,6 +83,10 @@ private:
     void add_turns();
     void advance_multipliers();
     bool solve(Coordinates& p, int& newton_steps);
+    bool find_minimiser(Coordinates& p, int& newton_steps, Coordinates& y_end);
+    void follow(Coordinates& p, bool driven, Way& way, Coordinates& y_end);
+    bool solve_where_it_ends(
+        const Coordinates& y_end, const std::vector<Impact>& impacts, Coordinates& p, int& newton_steps);
     bool turns_too_far(const Coordinates& p);
     bool add_missed(const Coordinates& y_end);
     void set_end(const Coordinates& p, Coordinates& y_end) const;
