@@ -4,7 +4,7 @@
 # make test       C++ and Python tests, the latter against the installed package
 # make check      after a change: what it touches is compiled and tested, the rest and all that is slow is left out
 # make sanitize   C++ tests in a Debug build with address and undefined-behaviour sanitizers
-# make lint       formatting, lint, types
+# make lint       formatting, lint, types, lengths of files and functions
 # make docs       the documentation as a site, build/docs/index.html
 # make bench      every benchmark, one CSV line per run
 # make report     error against run time beside MuJoCo, docs/report/; then the limits, docs/limits.md
@@ -77,6 +77,7 @@ lint: $(VENV)/.lint-tools
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $(CXX_FILES)
 	$(BIN)/mypy
+	$(BIN)/python tests/python/test_sizes.py
 
 format: $(VENV)/.lint-tools
 	$(BIN)/ruff check --fix

@@ -17,7 +17,7 @@ from test_layering import ROOMS, reachable_rooms  # noqa: E402
 
 # Of a change in the core: the layer end to end, in seconds. What else there is is slower, or about other things.
 END_TO_END = ("closed_forms", "contacts", "determinism", "failures", "ops", "simulator", "stub")
-ALWAYS = ("layering", "import")
+ALWAYS = ("layering", "import", "sizes")
 
 
 def changed_files() -> list[Path]:
