@@ -138,42 +138,42 @@ py::tuple row_axes(const Input& input) {
 }
 
 /// Why a step did not converge, or nothing.
-const char* failure_text(ZoneStatus status) {
+const char* failure_text(StepStatus status) {
     switch (status) {
-        case ZoneStatus::converged:
+        case StepStatus::converged:
             return "";
-        case ZoneStatus::too_many_iterations:
+        case StepStatus::too_many_iterations:
             return "max_iterations reached";
-        case ZoneStatus::no_descent:
+        case StepStatus::no_descent:
             return "no step lowers the energy";
-        case ZoneStatus::spinning:
+        case StepStatus::spinning:
             return "a body spins too fast";
-        case ZoneStatus::blocked:
+        case StepStatus::blocked:
             return "a driven body is blocked: something is squeezed";
-        case ZoneStatus::bad_start:
+        case StepStatus::bad_start:
             return "objects penetrate at the start";
-        case ZoneStatus::overflow:
+        case StepStatus::overflow:
             return "a motion is too large for numbers to hold";
     }
     return "";
 }
 
 /// The same as one word.
-const char* status_text(ZoneStatus status) {
+const char* status_text(StepStatus status) {
     switch (status) {
-        case ZoneStatus::converged:
+        case StepStatus::converged:
             return "converged";
-        case ZoneStatus::too_many_iterations:
+        case StepStatus::too_many_iterations:
             return "max_iterations";
-        case ZoneStatus::no_descent:
+        case StepStatus::no_descent:
             return "no_descent";
-        case ZoneStatus::spinning:
+        case StepStatus::spinning:
             return "spinning";
-        case ZoneStatus::blocked:
+        case StepStatus::blocked:
             return "blocked";
-        case ZoneStatus::bad_start:
+        case StepStatus::bad_start:
             return "penetrating";
-        case ZoneStatus::overflow:
+        case StepStatus::overflow:
             return "overflow";
     }
     return "";

@@ -116,7 +116,7 @@ RolloutInfo rollout(
                 std::vector<int> pair = {start.a};
                 if (start.b != kGround && start.b != start.a) pair.push_back(start.b);
                 std::sort(pair.begin(), pair.end());
-                state = hold(state, ZoneStatus::bad_start, std::move(pair), info.last, record);
+                state = hold(state, StepStatus::bad_start, std::move(pair), info.last, record);
             }
             info.fast_impacts += info.last.fast_impacts;
             if (!info.last.converged) note_failure(info.last, scene, shape.first_step + time, info);

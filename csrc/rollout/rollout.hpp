@@ -54,7 +54,7 @@ struct Tape {
 struct FailedStep {
     int scene = 0;
     int step = 0;  ///< of the whole rollout: steps that other calls made before count
-    ZoneStatus status = ZoneStatus::converged;
+    StepStatus status = StepStatus::converged;
     std::vector<int> objects;  ///< see StepInfo::failed_objects
     int iterations = 0;
     double residual = 0.0;
@@ -67,7 +67,7 @@ struct RolloutInfo {
     bool converged = true;
     int failed_steps = 0;
     int fast_impacts = 0;                       ///< of all steps
-    ZoneStatus status = ZoneStatus::converged;  ///< of the first of `failures`
+    StepStatus status = StepStatus::converged;  ///< of the first of `failures`
     std::vector<FailedStep> failures;           ///< the first kMaxFailures, by step, then scene
     std::vector<char> scenes_converged;         ///< all steps of each scene
     bool has_batch = false;                     ///< see RolloutShape

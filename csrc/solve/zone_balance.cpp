@@ -17,7 +17,8 @@ constexpr int kStandsStill = 3;  // models in balance without halving their moti
 
 class BalanceSearch {
 public:
-    BalanceSearch(ZoneSearch& search, ModelDirection& model) : m_search(search), m_model(model), m_w(search.m_w) {}
+    BalanceSearch(ZoneSearch& search, ModelDirection& model)
+        : m_search(search), m_model(model), m_work(search.m_work) {}
 
     void run() {
         for (m_search.m_result.iterations = 0;; ++m_search.m_result.iterations) {
@@ -25,19 +26,19 @@ public:
             const bool driven = m_search.drives_done();
             const Accuracy now = look();
             if (m_search.m_result.iterations >= m_search.m_options.max_iterations)
-                return m_search.fail(ZoneStatus::too_many_iterations);
+                return m_search.fail(StepStatus::too_many_iterations);
             if (m_search.m_result.iterations == 0 && driven && rests(now)) return;
-            const ModelDirection::Way way = m_model.find(m_w.derivatives.gradient, driven, m_w.y_end);
-            if (!way.found) return m_search.fail(ZoneStatus::no_descent);
+            const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
+            if (!way.found) return m_search.fail(StepStatus::no_descent);
             const double motion = motion_to_end();
-            const double step = m_search.m_path.covered_step(m_w.y_end, way.free);
+            const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
             if (!driven) {
-                if (!follow_drives(way, step)) return m_search.fail(ZoneStatus::blocked);
+                if (!follow_drives(way, step)) return m_search.fail(StepStatus::blocked);
                 continue;
             }
-            m_search.m_path.set_trial(m_w.y_end, step);
-            if (step == 1.0) m_w.trial.y = m_w.y_end;
-            evaluate(zone(), m_w.trial, &m_w.point);
+            m_search.m_path.set_trial(m_work.y_end, step);
+            if (step == 1.0) m_work.trial.y = m_work.y_end;
+            evaluate(zone(), m_work.trial, &m_work.point);
             const bool is_first = m_search.m_result.iterations == 0;
             if (!is_first && step == 1.0 && now.residual < kGoodEnough * m_wanted &&
                 (motion <= kRest * now.reference || stands_still(motion)))
@@ -54,8 +55,8 @@ private:
 
     /// What is left of the balance at the point, and what that asks of the next model.
     Accuracy look() {
-        differentiate(zone(), m_w.point, Curvature::none, m_w.derivatives, nullptr);
-        m_balance = m_w.derivatives.gradient;
+        differentiate(zone(), m_work.point, Curvature::none, m_work.derivatives, nullptr);
+        m_balance = m_work.derivatives.gradient;
         m_model.add_friction_forces(m_balance);
         Accuracy now = m_search.current_accuracy();
         now.residual = now.reference > 0.0 ? largest_scaled(zone(), m_balance) / now.reference : 0.0;
@@ -74,11 +75,11 @@ private:
 
     /// Of the way to y_end.
     double motion_to_end() {
-        Coordinates& way = m_w.step;
+        Coordinates& way = m_work.step;
         way.resize(static_cast<std::size_t>(zone().dynamic_count), zone().nodes.size());
-        const Coordinates& y = m_w.point.y;
-        for (std::size_t i = 0; i < way.bodies.size(); ++i) way.bodies[i] = m_w.y_end.bodies[i] - y.bodies[i];
-        for (std::size_t i = 0; i < way.nodes.size(); ++i) way.nodes[i] = m_w.y_end.nodes[i] - y.nodes[i];
+        const Coordinates& y = m_work.point.y;
+        for (std::size_t i = 0; i < way.bodies.size(); ++i) way.bodies[i] = m_work.y_end.bodies[i] - y.bodies[i];
+        for (std::size_t i = 0; i < way.nodes.size(); ++i) way.nodes[i] = m_work.y_end.nodes[i] - y.nodes[i];
         return largest_motion(zone(), way);
     }
 
@@ -98,16 +99,16 @@ private:
 
     /// Whether energy and what friction takes up rise; then the model is damped.
     bool rises(double step) {
-        const double change = m_w.trial.energy - m_w.point.energy + m_model.friction_work(step);
+        const double change = m_work.trial.energy - m_work.point.energy + m_model.friction_work(step);
         if (change <= m_search.current_noise() || m_damped >= kMaxDamped) return false;
         ++m_damped;
-        m_model.damp(m_w.trial, change);
+        m_model.damp(m_work.trial, change);
         return true;
     }
 
     ZoneSearch& m_search;
     ModelDirection& m_model;
-    ZoneWorkspace& m_w;
+    ZoneWorkspace& m_work;
     Coordinates m_balance;  // what is left of it
     double m_wanted = 0.0;  // the residual asked for
     double m_least_motion = kInfinity;
@@ -118,10 +119,10 @@ private:
 
 void find_balance(ZoneSearch& search, ModelDirection& model) {
     BalanceSearch(search, model).run();
-    search.m_w.friction.resize(search.m_w.point.active.size());
+    search.m_work.friction.resize(search.m_work.point.active.size());
     const std::vector<FrictionState>& states = model.friction();
-    for (std::size_t k = 0; k < search.m_w.friction.size(); ++k)
-        search.m_w.friction[k] = states[static_cast<std::size_t>(search.m_w.point.active[k].index)];
+    for (std::size_t k = 0; k < search.m_work.friction.size(); ++k)
+        search.m_work.friction[k] = states[static_cast<std::size_t>(search.m_work.point.active[k].index)];
 }
 
 }  // namespace diffsim

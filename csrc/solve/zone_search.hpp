@@ -16,19 +16,19 @@ class ZoneSearch {
 public:
     ZoneSearch(
         Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-        std::vector<Box>& visited)
+        std::vector<Box>& swept)
         : m_zone(zone),
           m_options(options),
-          m_w(workspace),
-          m_visited(visited),
+          m_work(workspace),
+          m_swept(swept),
           m_path(zone, passive, workspace.point, workspace.trial, workspace.coverage, workspace.system) {}
 
-    Coordinates& y() { return m_w.point.y; }
-    void fail(ZoneStatus status) { m_result.status = status; }
+    Coordinates& y() { return m_work.point.y; }
+    void fail(StepStatus status) { m_result.status = status; }
 
     /// Go to the trial.
     void accept_trial();
-    void mark_visited();
+    void mark_swept();
 
     /// Whether all that is driven has reached its target.
     bool drives_done() const;
@@ -43,8 +43,8 @@ public:
 
     const Zone& m_zone;  // its contacts change by m_path alone
     const ZoneOptions& m_options;
-    ZoneWorkspace& m_w;
-    std::vector<Box>& m_visited;
+    ZoneWorkspace& m_work;
+    std::vector<Box>& m_swept;
     ZonePath m_path;
     ZoneResult m_result;
 };

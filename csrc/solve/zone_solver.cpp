@@ -37,8 +37,8 @@ public:
             take_full_steps(*m_options.full_steps);
             return m_result;
         }
-        m_w.friction.clear();
-        if (m_result.status == ZoneStatus::bad_start || try_free_motion()) return m_result;
+        m_work.friction.clear();
+        if (m_result.status == StepStatus::bad_start || try_free_motion()) return m_result;
         go_to_warm_start();
         m_near = is_one_body();  // a factor costs hardly more than the gradient alone
         find_solution();
@@ -53,27 +53,27 @@ private:
 
     void start() {
         const std::size_t count = static_cast<std::size_t>(m_zone.dynamic_count);
-        m_w.point.y.assign_zero(count, m_zone.nodes.size());
-        m_w.y_end.resize(count, m_zone.nodes.size());
-        set_to_expected_ends(m_w.y_end);
-        m_path.list_contacts(m_w.y_end);
-        evaluate(m_zone, m_w.point);
+        m_work.point.y.assign_zero(count, m_zone.nodes.size());
+        m_work.y_end.resize(count, m_zone.nodes.size());
+        set_to_expected_ends(m_work.y_end);
+        m_path.list_contacts(m_work.y_end);
+        evaluate(m_zone, m_work.point);
         bool rescue = false;  // some objects start the step below their floor
         for (std::size_t k = 0; k < m_zone.contacts.size(); ++k) {
             const ContactRange& range = m_zone.contacts.law(k).range;
-            rescue = rescue || m_w.point.distances[k] < range.floor;
-            if (m_w.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
-            m_result.status = ZoneStatus::bad_start;
+            rescue = rescue || m_work.point.distances[k] < range.floor;
+            if (m_work.point.distances[k] > range.limit + 4.0 * kEpsilon * range.rest) continue;
+            m_result.status = StepStatus::bad_start;
             m_result.worst_contact = static_cast<int>(k);
             return;
         }
         if (rescue) m_path.rescue();
-        m_visited.assign(count + m_zone.cloths.size(), Box());
-        mark_visited();
+        m_swept.assign(count + m_zone.cloths.size(), Box());
+        mark_swept();
         // That of one body is made if ever it is asked for, which at rest without friction it is not.
         if (is_one_body() && !m_zone.contacts.with_friction) return;
         make_model();
-        m_model->start_from(m_w.point);
+        m_model->start_from(m_work.point);
     }
 
     /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that reach
@@ -92,37 +92,37 @@ private:
 
     /// Nothing touches on the way to the target and there: done without an iteration.
     bool try_free_motion() {
-        m_w.y_end.bodies.resize(m_zone.bodies.size());
-        m_path.set_to_targets(m_w.y_end);
-        const bool touching = !m_w.point.active.empty();
-        if (touching && !may_pass(m_zone, m_w.y_end)) return false;
-        m_path.ensure_covered(m_w.y_end);
+        m_work.y_end.bodies.resize(m_zone.bodies.size());
+        m_path.set_to_targets(m_work.y_end);
+        const bool touching = !m_work.point.active.empty();
+        if (touching && !may_pass(m_zone, m_work.y_end)) return false;
+        m_path.ensure_covered(m_work.y_end);
         if ((m_zone.dynamic_count > 0 || !m_zone.elastic) &&
-            allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) {
-            m_result.fast_impacts = m_path.set_gates(m_w.y_end);
+            allowed_step(m_zone, m_work.point, m_work.y_end, nullptr) < 1.0) {
+            m_result.fast_impacts = m_path.set_gates(m_work.y_end);
             return false;
         }
         if (touching) return false;
         if (!m_zone.cloths.empty() && m_zone.elastic) return false;
-        m_w.trial.y = m_w.y_end;
-        evaluate(m_zone, m_w.trial, &m_w.point);
-        if (!m_w.trial.active.empty()) return false;
+        m_work.trial.y = m_work.y_end;
+        evaluate(m_zone, m_work.trial, &m_work.point);
+        if (!m_work.trial.active.empty()) return false;
         accept_trial();
         return true;
     }
 
     /// Last step's motion already respected last step's contacts: it is the natural first iterate.
     void go_to_warm_start() {
-        m_w.y_end = y();
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] = m_zone.bodies[i].last_motion;
+        m_work.y_end = y();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_work.y_end.bodies[i] = m_zone.bodies[i].last_motion;
         for (int i = 0; i < m_zone.node_count(); ++i)
-            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] = m_zone.nodes[i].last_motion;
+            if (!m_zone.nodes[i].pinned) m_work.y_end.nodes[i] = m_zone.nodes[i].last_motion;
         if (largest_move() < kEpsilon * m_path.position()) return;
-        m_path.ensure_covered(m_w.y_end);
+        m_path.ensure_covered(m_work.y_end);
         // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and
         // descend from there to minimisers that no motion of that energy can reach.
-        const double step = m_path.clear_step(m_w.y_end, Clearance::landing);
-        if (step > 0.0 && m_w.trial.energy <= m_w.point.energy) accept_trial();
+        const double step = m_path.clear_step(m_work.y_end, Clearance::landing);
+        if (step > 0.0 && m_work.trial.energy <= m_work.point.energy) accept_trial();
     }
 
     // --- Newton ------------------------------------------------------------------------------------------------
@@ -130,20 +130,20 @@ private:
     double slope(const Coordinates& gradient) const {
         double sum = 0.0;
         for (int i = 0; i < m_zone.dynamic_count; ++i)
-            sum += gradient.bodies[i].dot(m_w.y_end.bodies[i] - m_w.point.y.bodies[i]);
+            sum += gradient.bodies[i].dot(m_work.y_end.bodies[i] - m_work.point.y.bodies[i]);
         for (int i = 0; i < m_zone.node_count(); ++i)
-            sum += gradient.nodes[i].dot(m_w.y_end.nodes[i] - m_w.point.y.nodes[i]);
+            sum += gradient.nodes[i].dot(m_work.y_end.nodes[i] - m_work.point.y.nodes[i]);
         return sum;
     }
 
     double largest_move() const {
         double largest = 0.0;
         for (int i = 0; i < m_zone.dynamic_count; ++i) {
-            const Vec6 move = m_w.y_end.bodies[i] - m_w.point.y.bodies[i];
+            const Vec6 move = m_work.y_end.bodies[i] - m_work.point.y.bodies[i];
             largest = std::max({largest, move.tail<3>().norm(), move.head<3>().norm() * m_zone.mesh(i).radius});
         }
         for (int i = 0; i < m_zone.node_count(); ++i)
-            largest = std::max(largest, (m_w.y_end.nodes[i] - m_w.point.y.nodes[i]).norm());
+            largest = std::max(largest, (m_work.y_end.nodes[i] - m_work.point.y.nodes[i]).norm());
         return largest;
     }
 
@@ -151,22 +151,22 @@ private:
     /// tells. False if no step does.
     bool line_search(double first_step) {
         m_trial_is_differentiated = false;
-        const double slope0 = slope(m_w.derivatives.gradient);
+        const double slope0 = slope(m_work.derivatives.gradient);
         const double noise = current_noise();
         double step = first_step;
         for (int k = 0; k < kMaxHalvings && step > 0.0; ++k, step *= 0.5) {
             if (step == 1.0)
-                m_w.trial.y = m_w.y_end;
+                m_work.trial.y = m_work.y_end;
             else
-                m_path.set_trial(m_w.y_end, step);
-            if (step < 1.0 && k > 0 && allowed_step(m_zone, m_w.point, m_w.trial.y, nullptr) < 1.0) continue;
-            evaluate(m_zone, m_w.trial, &m_w.point);
-            const double change = m_w.trial.energy - m_w.point.energy;
+                m_path.set_trial(m_work.y_end, step);
+            if (step < 1.0 && k > 0 && allowed_step(m_zone, m_work.point, m_work.trial.y, nullptr) < 1.0) continue;
+            evaluate(m_zone, m_work.trial, &m_work.point);
+            const double change = m_work.trial.energy - m_work.point.energy;
             m_newton_full = step == 1.0;
             if (change <= kArmijo * step * slope0) return true;
             if (change <= noise) {
-                differentiate(m_zone, m_w.trial, Curvature::none, m_w.trial_derivatives, nullptr);
-                const double slope1 = std::abs(slope(m_w.trial_derivatives.gradient));
+                differentiate(m_zone, m_work.trial, Curvature::none, m_work.trial_derivatives, nullptr);
+                const double slope1 = std::abs(slope(m_work.trial_derivatives.gradient));
                 if (slope1 <= std::max(0.9 * std::abs(slope0), noise)) {
                     m_trial_is_differentiated = true;
                     return true;
@@ -182,18 +182,18 @@ private:
     bool finish_with_this_factor() {
         const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
         if (!m_newton.has_factor() || !(with_cloth || (m_newton.is_exact() && m_trial_is_differentiated))) return false;
-        const double stiffness = m_w.derivatives.largest_stiffness;  // known only with a Hessian
+        const double stiffness = m_work.derivatives.largest_stiffness;  // known only with a Hessian
         for (double before = m_result.residual;;) {
             if (m_trial_is_differentiated)
-                std::swap(m_w.derivatives, m_w.trial_derivatives);
+                std::swap(m_work.derivatives, m_work.trial_derivatives);
             else
-                differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+                differentiate(m_zone, m_work.point, Curvature::none, m_work.derivatives, nullptr);
             m_trial_is_differentiated = false;
-            m_w.derivatives.largest_stiffness = stiffness;
+            m_work.derivatives.largest_stiffness = stiffness;
             const Accuracy now = current_accuracy();
             const bool done = now.residual < std::max(m_options.tolerance, now.floor);
             if (!done && !(with_cloth && now.residual < kContraction * before)) return false;
-            if (!m_newton.repeat(m_zone, m_w.derivatives, m_w.system, m_w.step)) return false;
+            if (!m_newton.repeat(m_zone, m_work.derivatives, m_work.system, m_work.step)) return false;
             set_step_end();
             m_result.residual = before = now.residual;
             const bool moved = polish();
@@ -204,21 +204,21 @@ private:
 
     /// Where the Newton step ends.
     void set_step_end() {
-        m_w.y_end = y();
-        for (int i = 0; i < m_zone.dynamic_count; ++i) m_w.y_end.bodies[i] += m_w.step.bodies[i];
+        m_work.y_end = y();
+        for (int i = 0; i < m_zone.dynamic_count; ++i) m_work.y_end.bodies[i] += m_work.step.bodies[i];
         for (int i = 0; i < m_zone.node_count(); ++i)
-            if (!m_zone.nodes[i].pinned) m_w.y_end.nodes[i] += m_w.step.nodes[i];
+            if (!m_zone.nodes[i].pinned) m_work.y_end.nodes[i] += m_work.step.nodes[i];
     }
 
     /// By descent for as long as no contact with friction is near, then by balance.
     void find_solution() {
         if (!m_zone.contacts.with_friction) iterate();
-        if (!m_zone.contacts.with_friction || m_result.status != ZoneStatus::converged) return;
+        if (!m_zone.contacts.with_friction || m_result.status != StepStatus::converged) return;
         if (!m_model) make_model();
         find_balance(*this, *m_model);
     }
 
-    void make_model() { m_model.emplace(m_zone, m_path, m_w.point, m_w.system); }
+    void make_model() { m_model.emplace(m_zone, m_path, m_work.point, m_work.system); }
 
     void iterate() {
         int stalls = 0;
@@ -232,11 +232,11 @@ private:
             const bool driven = drives_done();
             if (m_result.iterations < m_options.max_iterations) {
                 const ModelStep step = take_model_step(driven, stalls);
-                if (step == ModelStep::blocked) return fail(ZoneStatus::blocked);
+                if (step == ModelStep::blocked) return fail(StepStatus::blocked);
                 if (step == ModelStep::taken) continue;
             }
-            if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
-                return fail(ZoneStatus::no_descent);
+            if (!m_newton.compute(m_zone, m_work.point, m_work.derivatives, m_work.system, m_work.step))
+                return fail(StepStatus::no_descent);
             const Accuracy now = current_accuracy();
             m_result.residual = now.residual;
             if (driven && leave_saddle(now)) continue;
@@ -255,17 +255,17 @@ private:
             stagnant = now.residual < 0.5 * best_residual ? 0 : stagnant + 1;
             best_residual = std::min(best_residual, now.residual);
             if (driven && stagnant >= kStagnantSteps && now.residual < good) return;
-            const bool lower = m_w.point.energy < lowest_energy - current_noise();
+            const bool lower = m_work.point.energy < lowest_energy - current_noise();
             futile = driven && !lower ? futile + 1 : 0;
-            if (lower || !driven) lowest_energy = m_w.point.energy;
-            if (futile >= kFutileSteps) return fail(ZoneStatus::no_descent);
-            if (m_result.iterations >= m_options.max_iterations) return fail(ZoneStatus::too_many_iterations);
+            if (lower || !driven) lowest_energy = m_work.point.energy;
+            if (futile >= kFutileSteps) return fail(StepStatus::no_descent);
+            if (m_result.iterations >= m_options.max_iterations) return fail(StepStatus::too_many_iterations);
 
             // The step's end may lie where contacts have not been listed yet. New ones are beyond their rest distance
             // here, so energy and derivatives stand.
-            m_path.ensure_covered(m_w.y_end);
-            double step = allowed_step(m_zone, m_w.point, m_w.y_end, nullptr);
-            if (step < 1.0 || !m_path.gates_hold(m_w.y_end)) step = m_path.arc_step(m_w.y_end, step);
+            m_path.ensure_covered(m_work.y_end);
+            double step = allowed_step(m_zone, m_work.point, m_work.y_end, nullptr);
+            if (step < 1.0 || !m_path.gates_hold(m_work.y_end)) step = m_path.arc_step(m_work.y_end, step);
             if (line_search(step)) {
                 m_near = m_newton.is_exact() && m_newton_full;
                 accept_trial();
@@ -275,7 +275,7 @@ private:
                     return;
                 }
             } else if (driven) {
-                if (now.residual >= good) fail(ZoneStatus::no_descent);
+                if (now.residual >= good) fail(StepStatus::no_descent);
                 return;
             }
         }
@@ -286,26 +286,27 @@ private:
     bool leave_saddle(const Accuracy& now) {
         if (m_left_saddle || !m_zone.nodes.empty() || m_newton.is_exact() || now.residual > kNearSolution) return false;
         m_left_saddle = true;
-        const Coordinates newton_step = m_w.step;
-        if (m_newton.off_saddle(m_zone, m_w.derivatives, m_w.system, m_w.step) && follow_off_saddle()) return true;
-        m_w.step = newton_step;
+        const Coordinates newton_step = m_work.step;
+        if (m_newton.off_saddle(m_zone, m_work.derivatives, m_work.system, m_work.step) && follow_off_saddle())
+            return true;
+        m_work.step = newton_step;
         return false;
     }
 
-    /// Go along the direction in m_w.step. False where that lowers the energy nowhere.
+    /// Go along the direction in m_work.step. False where that lowers the energy nowhere.
     bool follow_off_saddle() {
-        if (m_w.point.active.empty()) return false;
+        if (m_work.point.active.empty()) return false;
         set_step_end();
         double range = kInfinity;
-        for (const ActiveContact& active : m_w.point.active) {
+        for (const ActiveContact& active : m_work.point.active) {
             const ContactRange& r = m_zone.contacts.law(active.index).range;
             range = std::min(range, r.rest - r.floor);
         }
         const double scale = range / largest_move();
-        for (Vec6& s : m_w.step.bodies) s *= scale;
+        for (Vec6& s : m_work.step.bodies) s *= scale;
         set_step_end();
-        m_path.ensure_covered(m_w.y_end);
-        if (!line_search(m_path.arc_step(m_w.y_end, 1.0))) return false;
+        m_path.ensure_covered(m_work.y_end);
+        if (!line_search(m_path.arc_step(m_work.y_end, 1.0))) return false;
         accept_trial();
         return true;
     }
@@ -314,17 +315,17 @@ private:
     void take_full_steps(int count) {
         for (int i = 0; i < m_zone.node_count(); ++i)
             if (m_zone.nodes[i].pinned) y().nodes[i] = m_zone.nodes[i].target;
-        evaluate(m_zone, m_w.point);
+        evaluate(m_zone, m_work.point);
         for (m_result.iterations = 0; m_result.iterations < count; ++m_result.iterations) {
-            if (!m_newton.compute(m_zone, m_w.point, m_w.derivatives, m_w.system, m_w.step))
-                return fail(ZoneStatus::no_descent);
-            m_w.trial.y = y();
-            for (int i = 0; i < m_zone.node_count(); ++i) m_w.trial.y.nodes[i] += m_w.step.nodes[i];
-            evaluate(m_zone, m_w.trial, &m_w.point);
-            if (!std::isfinite(m_w.trial.energy)) return fail(ZoneStatus::no_descent);
-            std::swap(m_w.point, m_w.trial);
+            if (!m_newton.compute(m_zone, m_work.point, m_work.derivatives, m_work.system, m_work.step))
+                return fail(StepStatus::no_descent);
+            m_work.trial.y = y();
+            for (int i = 0; i < m_zone.node_count(); ++i) m_work.trial.y.nodes[i] += m_work.step.nodes[i];
+            evaluate(m_zone, m_work.trial, &m_work.point);
+            if (!std::isfinite(m_work.trial.energy)) return fail(StepStatus::no_descent);
+            std::swap(m_work.point, m_work.trial);
         }
-        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        differentiate(m_zone, m_work.point, Curvature::none, m_work.derivatives, nullptr);
         m_result.residual = current_accuracy().residual;
     }
 
@@ -332,15 +333,15 @@ private:
     enum class ModelStep { taken, near, blocked };
     ModelStep take_model_step(bool driven, int& stalls) {
         if ((m_near || m_model_factors > kMaxModelFactors) && driven) return ModelStep::near;
-        differentiate(m_zone, m_w.point, Curvature::none, m_w.derivatives, nullptr);
+        differentiate(m_zone, m_work.point, Curvature::none, m_work.derivatives, nullptr);
         m_result.residual = current_accuracy().residual;
         if (driven && m_result.residual < kNearSolution) return ModelStep::near;
         m_newton.lose_factor();
         if (!m_model) make_model();
-        const ModelDirection::Way way = m_model->find(m_w.derivatives.gradient, driven, m_w.y_end);
+        const ModelDirection::Way way = m_model->find(m_work.derivatives.gradient, driven, m_work.y_end);
         if (!m_zone.nodes.empty()) m_model_factors += way.newton_steps;
         if (!way.found) return ModelStep::near;
-        const double step = m_path.covered_step(m_w.y_end, way.free);
+        const double step = m_path.covered_step(m_work.y_end, way.free);
         if (!driven) {
             const DriveProgress progress = advance_drives(step, stalls);
             if (progress == DriveProgress::blocked) return ModelStep::blocked;
@@ -348,14 +349,14 @@ private:
             return way.squeezes && step < kSqueeze ? ModelStep::blocked : ModelStep::taken;
         }
         if (!(step > 0.0)) return ModelStep::near;
-        m_path.set_trial(m_w.y_end, step);
-        if (step == 1.0) m_w.trial.y = m_w.y_end;
-        evaluate(m_zone, m_w.trial, &m_w.point);
-        const double change = m_w.trial.energy - m_w.point.energy, noise = current_noise();
+        m_path.set_trial(m_work.y_end, step);
+        if (step == 1.0) m_work.trial.y = m_work.y_end;
+        evaluate(m_zone, m_work.trial, &m_work.point);
+        const double change = m_work.trial.energy - m_work.point.energy, noise = current_noise();
         if (change > noise) {
             // What rises with bodies is the contacts' energy, where rows are not true to them. Cloth buckles: a shorter step will do.
-            if (m_zone.nodes.empty() || !line_search(m_path.arc_step(m_w.y_end, 0.5 * step))) {
-                m_model->damp(m_w.trial, change);
+            if (m_zone.nodes.empty() || !line_search(m_path.arc_step(m_work.y_end, 0.5 * step))) {
+                m_model->damp(m_work.trial, change);
                 return ModelStep::taken;
             }
         }
@@ -368,22 +369,22 @@ private:
     /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel. False if there
     /// is nothing to gain.
     bool polish() {
-        if (m_w.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return false;
-        if (!m_path.covers(m_w.y_end)) return false;
-        if (allowed_step(m_zone, m_w.point, m_w.y_end, nullptr) < 1.0) return false;
-        m_w.trial.y = m_w.y_end;
-        evaluate(m_zone, m_w.trial, &m_w.point);
-        if (!(m_w.trial.energy <= m_w.point.energy + current_noise())) return false;
+        if (m_work.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return false;
+        if (!m_path.covers(m_work.y_end)) return false;
+        if (allowed_step(m_zone, m_work.point, m_work.y_end, nullptr) < 1.0) return false;
+        m_work.trial.y = m_work.y_end;
+        evaluate(m_zone, m_work.trial, &m_work.point);
+        if (!(m_work.trial.energy <= m_work.point.energy + current_noise())) return false;
         accept_trial();
         return true;
     }
 
     /// Rounds of multipliers until exact contacts are at their rest distance.
     void multiplier_rounds() {
-        for (int round = 0; m_result.status == ZoneStatus::converged; ++round) {
-            const double violation = MultiplierRounds::violation(m_zone, m_w.point, m_path.position());
+        for (int round = 0; m_result.status == StepStatus::converged; ++round) {
+            const double violation = MultiplierRounds::violation(m_zone, m_work.point, m_path.position());
             if (violation <= kExactTolerance) return;
-            if (round >= kMaxMultiplierRounds) return fail(ZoneStatus::too_many_iterations);
+            if (round >= kMaxMultiplierRounds) return fail(StepStatus::too_many_iterations);
             m_path.shift_contacts(m_rounds.stiffening(m_zone, violation));
             find_solution();
         }
@@ -403,8 +404,8 @@ private:
 
 ZoneResult solve_zone(
     Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-    std::vector<Box>& visited) {
-    return ZoneSolver(zone, passive, options, workspace, visited).solve();
+    std::vector<Box>& swept) {
+    return ZoneSolver(zone, passive, options, workspace, swept).solve();
 }
 
 }  // namespace diffsim

@@ -12,14 +12,14 @@ namespace diffsim {
 
 class Interrupt;
 
-enum class ZoneStatus {
+enum class StepStatus {
     converged,
     too_many_iterations,
     no_descent,  ///< the line search found no lower energy
-    spinning,    ///< never of a zone: a body turns further than its free motion can be solved for
+    spinning,    ///< a body turns further than its free motion can be solved for; never of a zone
     blocked,     ///< a driven body cannot reach its target: something is squeezed
     bad_start,   ///< objects at or below their pole at the start of the step
-    overflow,    ///< never of a zone: a motion is too large for numbers to hold
+    overflow,    ///< a motion is too large for numbers to hold; never of a zone
 };
 
 struct ZoneOptions {
@@ -32,7 +32,7 @@ struct ZoneOptions {
 };
 
 struct ZoneResult {
-    ZoneStatus status = ZoneStatus::converged;
+    StepStatus status = StepStatus::converged;
     int iterations = 0;      ///< Newton steps
     double residual = 0.0;   ///< largest |L⁻¹ g| of a body, M = L Lᵀ, relative to the largest contact force
     int fast_impacts = 0;    ///< pairs of bodies with a fast ImpactGate
@@ -52,10 +52,10 @@ struct ZoneWorkspace {
 
 /// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts after
 /// the other, the last steps by Newton's method, as docs/solver.md describes. On return workspace.point is the last iterate: the
-/// minimiser, or if the status says so the last penetration-free point before failure. `visited`, one box per dynamic
+/// minimiser, or if the status says so the last penetration-free point before failure. `swept`, one box per dynamic
 /// body, receives the space swept by the bodies' vertices in the zone frame.
 ZoneResult solve_zone(
     Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
-    std::vector<Box>& visited);
+    std::vector<Box>& swept);
 
 }  // namespace diffsim

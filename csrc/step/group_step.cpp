@@ -73,15 +73,15 @@ GroupOutcome GroupStep::solve(
     join(group, members, objects, zone);
     GroupOutcome outcome;
     outcome.solved = true;
-    outcome.result = solve_zone(zone, objects.passive, zone_options(), memory.zone.workspace, memory.zone.visited);
+    outcome.result = solve_zone(zone, objects.passive, zone_options(), memory.zone.workspace, memory.zone.swept);
     const ZonePoint& point = memory.zone.workspace.point;
-    if (outcome.result.status == ZoneStatus::bad_start)
+    if (outcome.result.status == StepStatus::bad_start)
         refuse_start(zone.contacts[outcome.result.worst_contact], point.distances[outcome.result.worst_contact]);
     write_motion(group, members, memory.zone, objects);
     keep_contacts(
         zone, point, m_parameters.friction.empty() ? nullptr : &memory.zone.workspace.friction, outcome,
         memory.results);
-    if (outcome.result.status != ZoneStatus::converged) keep_failure(group.root, zone, point, memory.results);
+    if (outcome.result.status != StepStatus::converged) keep_failure(group.root, zone, point, memory.results);
     return outcome;
 }
 
@@ -91,7 +91,7 @@ ZoneResult GroupStep::solve_elastic(int cloth, ZoneMemory& memory) const {
     add_cloth(zone, cloth, m_state, m_control, m_parameters);
     ZoneOptions options = zone_options();
     options.full_steps = m_options.newton_iterations;
-    return solve_zone(zone, PassiveBodies(), options, memory.workspace, memory.visited);
+    return solve_zone(zone, PassiveBodies(), options, memory.workspace, memory.swept);
 }
 
 ZoneOptions GroupStep::zone_options() const {
@@ -135,11 +135,11 @@ void GroupStep::write_motion(
     const ZonePoint& point = memory.workspace.point;
     for (int k = group.first; k < group.end; ++k) {
         const int i = members[k];
-        Box& visited = objects.visited[i];
-        visited = memory.visited[k - group.first];
-        visited.inflate(m_model.margin(i));
-        visited.lower += zone.origin;
-        visited.upper += zone.origin;
+        Box& swept = objects.swept[i];
+        swept = memory.swept[k - group.first];
+        swept.inflate(m_model.margin(i));
+        swept.lower += zone.origin;
+        swept.upper += zone.origin;
         if (!m_model.is_cloth(i)) objects.y.bodies[i] = point.y.bodies[k - group.first];
     }
     for (const ZoneCloth& cloth : zone.cloths)

@@ -39,8 +39,8 @@ public:
         const std::vector<ZoneBody>& bodies;     ///< the dynamic ones at their start
         const std::vector<Vec3>& elastic_shift;  ///< with split coupling: each node's motion without contact
         const PassiveBodies& passive;
-        Coordinates& y;             ///< receives the motion of those that yield
-        std::vector<Box>& visited;  ///< receives the space that they went through: world frame, margins included
+        Coordinates& y;           ///< receives the motion of those that yield
+        std::vector<Box>& swept;  ///< receives the space that they went through: world frame, margins included
     };
 
     /// Solve a group whose objects `members` lists. Contacts, blocked drives and who failed are added to the thread's results.

@@ -35,15 +35,15 @@ std::vector<std::pair<int, int>> ObjectGroups::overlaps() {
     return overlapping_pairs(m_tree);
 }
 
-std::vector<std::pair<int, int>> ObjectGroups::include_visited(const std::vector<Box>& visited) {
+std::vector<std::pair<int, int>> ObjectGroups::include_swept(const std::vector<Box>& swept) {
     bool left = false;
     for (int i : m_movers) {
-        left = left || (visited[i].lower.array() < m_space[i].lower.array()).any() ||
-               (visited[i].upper.array() > m_space[i].upper.array()).any();
+        left = left || (swept[i].lower.array() < m_space[i].lower.array()).any() ||
+               (swept[i].upper.array() > m_space[i].upper.array()).any();
     }
     std::vector<std::pair<int, int>> joined;
     if (!left) return joined;
-    for (int i : m_movers) m_space[i].include(visited[i]);
+    for (int i : m_movers) m_space[i].include(swept[i]);
     for (const auto& [a, b] : overlaps()) {
         const int i = m_groups.find(m_movers[a]), j = m_groups.find(m_movers[b]);
         if (i == j) continue;

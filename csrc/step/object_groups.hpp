@@ -29,9 +29,9 @@ public:
     void unite_all();
     void unite_overlapping();
 
-    /// Objects that were pushed out of their space may have met others: adds what they visited (of all objects) to it, and
+    /// Objects that were pushed out of their space may have met others: adds what they swept (of all objects) to it, and
     /// joins groups that overlap now. The joined pairs, by their roots before.
-    std::vector<std::pair<int, int>> include_visited(const std::vector<Box>& visited);
+    std::vector<std::pair<int, int>> include_swept(const std::vector<Box>& swept);
 
     /// All groups by their roots, ascending. Valid until groups are united again.
     const std::vector<ObjectGroup>& sorted();

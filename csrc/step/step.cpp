@@ -34,8 +34,8 @@ struct StepWorkspace::ForwardScratch {
     std::vector<ZoneBody> bodies;  ///< the dynamic ones
     // One entry per object: the bodies, then the cloths.
     std::vector<GroupOutcome> outcomes;
-    std::vector<Box> visited;  ///< world frame, margins included
-    std::vector<char> dirty;   ///< groups to be solved, at their smallest object
+    std::vector<Box> swept;   ///< world frame, margins included
+    std::vector<char> dirty;  ///< groups to be solved, at their smallest object
     ObjectGroups groups;
 
     std::atomic<bool> overflow{false};
@@ -74,7 +74,7 @@ public:
         m_info = StepInfo{};
         Clock::time_point clock = Clock::now();
         predict();
-        if (m_scratch.overflow) return hold(m_state, ZoneStatus::overflow, overflown_objects(m_state), m_info, record);
+        if (m_scratch.overflow) return hold(m_state, StepStatus::overflow, overflown_objects(m_state), m_info, record);
         if (m_options.split) move_cloths_alone();
         m_info.seconds_motion = seconds_since(clock);
         for (int attempt = 0;; ++attempt) {
@@ -92,7 +92,7 @@ public:
         }
         find_zones();
         const SceneState result = finish();
-        if (m_scratch.overflow) return hold(m_state, ZoneStatus::overflow, overflown_objects(result), m_info, record);
+        if (m_scratch.overflow) return hold(m_state, StepStatus::overflow, overflown_objects(result), m_info, record);
         if (record != nullptr) write(*record);
         m_info.seconds_motion += seconds_since(clock);
         return result;
@@ -138,16 +138,16 @@ private:
             ZoneMemory& memory = m_workspace.memory().zone;
             const ZoneResult result = m_group_step.solve_elastic(c, memory);
             note(result);
-            if (result.status != ZoneStatus::converged) fail(m_model.body_count() + c);
+            if (result.status != StepStatus::converged) fail(m_model.body_count() + c);
             const std::vector<Vec3>& shift = memory.workspace.point.y.nodes;
             std::copy(shift.begin(), shift.end(), m_scratch.elastic_shift.begin() + m_model.cloths[c].first_node);
         }
     }
 
     void note(const ZoneResult& result) {
-        if (result.status != ZoneStatus::converged) {
+        if (result.status != StepStatus::converged) {
             m_info.converged = false;
-            if (m_info.status == ZoneStatus::converged) m_info.status = result.status;
+            if (m_info.status == StepStatus::converged) m_info.status = result.status;
         }
         m_info.iterations = std::max(m_info.iterations, result.iterations);
         m_info.residual = std::max(m_info.residual, result.residual);
@@ -212,7 +212,7 @@ private:
             if (stop.obstacle == kNobody) continue;
             m_scratch.y.bodies[driven.id] *= stop.part;
             m_info.converged = false;
-            m_info.status = ZoneStatus::blocked;
+            m_info.status = StepStatus::blocked;
             fail(driven.id);
             fail(stop.obstacle);
             any = true;
@@ -222,7 +222,7 @@ private:
 
     void group() {
         const std::size_t count = static_cast<std::size_t>(object_count());
-        m_scratch.visited.resize(count);
+        m_scratch.swept.resize(count);
         m_scratch.outcomes.assign(count, GroupOutcome{});
         m_scratch.dirty.assign(count, 1);
         m_workspace.for_each_memory([](ThreadMemory& memory) { memory.results.clear(); });
@@ -293,12 +293,12 @@ private:
         if (moves_freely(group, own.near)) {
             outcome = GroupOutcome{};
             m_scratch.y.bodies[group.root] = m_scratch.bodies[group.root].target;
-            m_scratch.visited[group.root] = m_scratch.groups.space(group.root);
+            m_scratch.swept[group.root] = m_scratch.groups.space(group.root);
             return;
         }
         outcome = m_group_step.solve(
             group, m_scratch.groups.members(),
-            {m_scratch.bodies, m_scratch.elastic_shift, m_scratch.passive, m_scratch.y, m_scratch.visited}, own);
+            {m_scratch.bodies, m_scratch.elastic_shift, m_scratch.passive, m_scratch.y, m_scratch.swept}, own);
         outcome.thread = thread;
     }
 
@@ -310,7 +310,7 @@ private:
     /// Groups whose objects were pushed to where they may have met others are to be solved again, together. False if there
     /// are none.
     bool merge_met_groups() {
-        const auto joined = m_scratch.groups.include_visited(m_scratch.visited);
+        const auto joined = m_scratch.groups.include_swept(m_scratch.swept);
         for (const auto& [i, j] : joined) {
             m_scratch.outcomes[i] = m_scratch.outcomes[j] = GroupOutcome{};
             m_scratch.dirty[std::min(i, j)] = 1;
@@ -321,7 +321,7 @@ private:
     /// What drives could not do for one zone they must not do for any.
     void shorten_drives(bool stop) {
         m_info.converged = false;
-        m_info.status = ZoneStatus::blocked;
+        m_info.status = StepStatus::blocked;
         for (const BlockedDrive& blocked : m_scratch.blocked) {
             fail_group(blocked.group);
             Vec6& y = m_scratch.y.bodies[blocked.body];
@@ -365,7 +365,7 @@ private:
             const GroupOutcome& outcome = m_scratch.outcomes[root];
             if (!outcome.solved) continue;
             note(outcome.result);
-            if (outcome.result.status != ZoneStatus::converged) fail_group(root);
+            if (outcome.result.status != StepStatus::converged) fail_group(root);
             m_info.fast_impacts += outcome.result.fast_impacts;
             m_info.sticking += outcome.sticking;
             m_info.slipping += outcome.slipping;
@@ -375,7 +375,7 @@ private:
         for (int i : m_scratch.dynamic) {
             if (m_scratch.rotation[i].substeps > 0) continue;
             m_info.converged = false;
-            if (m_info.status == ZoneStatus::converged) m_info.status = ZoneStatus::spinning;
+            if (m_info.status == StepStatus::converged) m_info.status = StepStatus::spinning;
             fail(i);
         }
         SceneState result = m_state;
@@ -451,7 +451,7 @@ SceneState solve_part(
 }
 
 SceneState hold(
-    const SceneState& state, ZoneStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record) {
+    const SceneState& state, StepStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record) {
     info = StepInfo{};
     info.converged = false;
     info.status = status;

@@ -43,7 +43,7 @@ struct StepRecord {
 
 struct StepInfo {
     bool converged = true;
-    ZoneStatus status = ZoneStatus::converged;  ///< of the first zone that did not converge
+    StepStatus status = StepStatus::converged;  ///< of the first zone that did not converge
     int contacts = 0;
     int sticking = 0, slipping = 0;  ///< of those with friction
     int zones = 0;                   ///< groups of bodies and cloths in contact
@@ -73,7 +73,7 @@ public:
 struct ZoneMemory {
     Zone zone;
     ZoneWorkspace workspace;
-    std::vector<Box> visited;
+    std::vector<Box> swept;
 };
 
 struct ThreadMemory;
@@ -122,7 +122,7 @@ SceneState step(
 
 /// What takes the place of a step that cannot be taken because of these objects: the state, unchanged and not converged.
 SceneState hold(
-    const SceneState& state, ZoneStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record);
+    const SceneState& state, StepStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record);
 
 /// Carry the gradient at the end of a step back to its start. `gradient` is overwritten; control and parameter
 /// gradients are added to. What `needs` does not ask for is incomplete.

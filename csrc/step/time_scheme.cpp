@@ -88,10 +88,10 @@ SceneState step(
     StepInfo velocity_info;
     std::unique_ptr<StepRecord> velocity_record = record != nullptr ? std::make_unique<StepRecord>() : nullptr;
     const SceneState velocities = solve(StepPart::velocities, velocity_info, velocity_record.get());
-    if (velocity_info.status == ZoneStatus::overflow)
-        return hold(state, ZoneStatus::overflow, velocity_info.failed_objects, info, record);
+    if (velocity_info.status == StepStatus::overflow)
+        return hold(state, StepStatus::overflow, velocity_info.failed_objects, info, record);
     SceneState result = solve(StepPart::places, info, record);
-    if (info.status == ZoneStatus::overflow) return result;
+    if (info.status == StepStatus::overflow) return result;
     take_velocities(velocities, result);
     add_info(velocity_info, info);
     if (record != nullptr) record->velocities = std::move(velocity_record);

@@ -98,9 +98,9 @@ struct Scene {
     Zone solve(ZonePoint& point) const {
         Zone result = zone();
         ZoneWorkspace workspace;
-        std::vector<Box> visited;
-        const ZoneResult outcome = solve_zone(result, passive, ZoneOptions(), workspace, visited);
-        CHECK(outcome.status == ZoneStatus::converged);
+        std::vector<Box> swept;
+        const ZoneResult outcome = solve_zone(result, passive, ZoneOptions(), workspace, swept);
+        CHECK(outcome.status == StepStatus::converged);
         ContactSet active;
         for (const ActiveContact& a : workspace.point.active) append(active, result.contacts[a.index]);
         active.blocks = result.contacts.blocks;

@@ -20,7 +20,7 @@ struct PulledBox {
     std::vector<double> friction = {kFriction, kFriction};
     PassiveBodies nobody;
     ZoneWorkspace workspace;
-    std::vector<Box> visited;
+    std::vector<Box> swept;
     Zone zone;
 
     explicit PulledBox(double pull) {
@@ -34,8 +34,8 @@ struct PulledBox {
         zone.bodies.push_back(fixtures::zone_body(0, pose, 1.0, fixtures::box_inertia(half, 1.0)));
         zone.bodies.back().target << 0.0, 0.0, 0.0, pull, 0.0, -kFall;
         zone.dynamic_count = 1;
-        const ZoneResult result = solve_zone(zone, nobody, {}, workspace, visited);
-        CHECK(result.status == ZoneStatus::converged);
+        const ZoneResult result = solve_zone(zone, nobody, {}, workspace, swept);
+        CHECK(result.status == StepStatus::converged);
         CHECK(workspace.point.active.size() == 4);
         CHECK(workspace.friction.size() == 4);
     }

@@ -22,7 +22,7 @@ struct Cubes {
     std::vector<ClothParameters> materials;
     PassiveBodies nobody;
     ZoneWorkspace workspace;
-    std::vector<Box> visited;
+    std::vector<Box> swept;
     Zone zone;
 
     explicit Cubes(bool on_ground) {
@@ -39,7 +39,7 @@ struct Cubes {
         }
         zone.dynamic_count = 2;
     }
-    ZoneResult solve() { return solve_zone(zone, nobody, {}, workspace, visited); }
+    ZoneResult solve() { return solve_zone(zone, nobody, {}, workspace, swept); }
     int listed_pairs() const {
         int count = 0;
         for (const ZoneContact& contact : zone.contacts) count += contact.contact.with_ground() ? 0 : 1;
@@ -56,14 +56,14 @@ struct Cubes {
 
 TEST(bodies_held_by_something_list_no_neighbours_that_only_falling_would_bring_near) {
     Cubes held(true);
-    CHECK(held.solve().status == ZoneStatus::converged);
+    CHECK(held.solve().status == StepStatus::converged);
     CHECK(held.workspace.point.active.size() == 8);  // four vertices each, on the ground
     CHECK(held.listed_pairs() == 0);
 
     Cubes falling(true);
     for (ZoneBody& body : falling.zone.bodies)
         body.last_motion[5] = -kFall;  // as if it had moved so far in the last step
-    CHECK(falling.solve().status == ZoneStatus::converged);
+    CHECK(falling.solve().status == StepStatus::converged);
     CHECK_NEAR(falling.workspace.point.y.bodies[0], held.workspace.point.y.bodies[0], 1e-12);
 }
 
@@ -71,7 +71,7 @@ TEST(a_body_that_seems_held_meets_its_neighbour_all_the_same) {
     // Pushed aside on the ground: three times the gap, which is short of a tenth of its radius.
     Cubes pushed(true);
     pushed.zone.bodies[0].target[3] = 3.0 * kGap;
-    CHECK(pushed.solve().status == ZoneStatus::converged);
+    CHECK(pushed.solve().status == StepStatus::converged);
     CHECK(pushed.touching_pairs() > 0);
     const Coordinates& y = pushed.workspace.point.y;
     CHECK(y.bodies[0][3] > kGap);
@@ -80,7 +80,7 @@ TEST(a_body_that_seems_held_meets_its_neighbour_all_the_same) {
     // Without anything that holds it, too: it was at rest in the air.
     Cubes released(false);
     released.zone.bodies[0].target[3] = 3.0 * kGap;
-    CHECK(released.solve().status == ZoneStatus::converged);
+    CHECK(released.solve().status == StepStatus::converged);
     CHECK(released.touching_pairs() > 0);
 }
 
@@ -96,12 +96,12 @@ TEST(a_press_finds_in_few_steps_that_it_squeezes_a_pile) {
         target[5] = -way;
         pile.zone.bodies.resize(2);
         return solve_zone(
-            pile.zone, fixtures::passive_bodies(pile.model, {{2, above, target}}), {}, pile.workspace, pile.visited);
+            pile.zone, fixtures::passive_bodies(pile.model, {{2, above, target}}), {}, pile.workspace, pile.swept);
     };
-    CHECK(press(1e-4).status == ZoneStatus::converged);  // it comes to lie on the pile
+    CHECK(press(1e-4).status == StepStatus::converged);  // it comes to lie on the pile
     for (const double way : {1e-3, 5e-3, 2e-2}) {
         const ZoneResult result = press(way);
-        CHECK(result.status == ZoneStatus::blocked);
+        CHECK(result.status == StepStatus::blocked);
         CHECK(result.iterations <= 2);
         CHECK(pile.workspace.point.y.bodies[2][5] < -1e-4);  // it goes as far as there is room
     }

@@ -22,7 +22,7 @@ Box unit_box(double x) {
 struct Line {
     std::vector<int> movers;
     ObjectGroups groups;
-    std::vector<Box> visited;
+    std::vector<Box> swept;
 
     explicit Line(const std::vector<double>& places) { place(places); }
 
@@ -32,8 +32,8 @@ struct Line {
         const auto object = [](int k) { return 3 * (k / 2) + k % 2; };
         for (int k = 0; k < count; ++k) movers.push_back(object(k));
         groups.start(object(count) + 1, movers);
-        visited.resize(static_cast<std::size_t>(object(count)) + 1);
-        for (int k = 0; k < count; ++k) visited[movers[k]] = groups.space(movers[k]) = unit_box(places[k]);
+        swept.resize(static_cast<std::size_t>(object(count)) + 1);
+        for (int k = 0; k < count; ++k) swept[movers[k]] = groups.space(movers[k]) = unit_box(places[k]);
     }
 
     /// The movers of each group by their places in the list.
@@ -55,7 +55,7 @@ TEST(objects_whose_spaces_overlap_are_one_group) {
     Line line({0.0, 5.0, 0.5, 9.0, 1.4});  // objects 0, 1, 3, 4, 6
     line.groups.unite_overlapping();
     CHECK(line.sorted() == (Groups{{0, 3, 6}, {1}, {4}}));
-    CHECK(line.groups.include_visited(line.visited).empty());
+    CHECK(line.groups.include_swept(line.swept).empty());
     line.groups.unite_all();
     CHECK(line.sorted() == (Groups{{0, 1, 3, 4, 6}}));
 }
@@ -63,13 +63,13 @@ TEST(objects_whose_spaces_overlap_are_one_group) {
 TEST(groups_are_joined_where_an_object_left_its_space) {
     Line line({0.0, 5.0, 0.5, 9.0});
     line.groups.unite_overlapping();
-    line.visited[4] = unit_box(5.9);  // object 4, at 9, went to where object 1 is
-    const std::vector<std::pair<int, int>> joined = line.groups.include_visited(line.visited);
+    line.swept[4] = unit_box(5.9);  // object 4, at 9, went to where object 1 is
+    const std::vector<std::pair<int, int>> joined = line.groups.include_swept(line.swept);
     CHECK(joined == (std::vector<std::pair<int, int>>{{1, 4}}));
     CHECK(line.sorted() == (Groups{{0, 3}, {1, 4}}));
     CHECK(line.groups.space(4).lower.x() == 5.9);
     CHECK(line.groups.space(4).upper.x() == 10.0);
-    CHECK(line.groups.include_visited(line.visited).empty());
+    CHECK(line.groups.include_swept(line.swept).empty());
 }
 
 TEST(groups_of_the_next_step_do_not_depend_on_the_last_one) {
