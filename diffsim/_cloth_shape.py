@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ._arguments import finite_array
 from ._mass_properties import FloatArray, IntArray
-from ._mesh import check_triangles, read_mesh_in_order, to_numpy
+from ._mesh import check_triangles, find_repeated, read_mesh_in_order, to_numpy
 from ._mesh_queries import point_triangle_distance, segment_segment_distance
 
 # A triangle lower than this fraction of its longest edge, at rest, has no strain worth the name (csrc/model/cloth.cpp).
@@ -75,34 +75,28 @@ def _require_sheet(vertices: FloatArray, triangles: IntArray, where: str) -> Non
             f"{where}: mesh vertex {first} is in no triangle ({np.count_nonzero(~used)} of {len(vertices)} vertices), "
             "and every vertex becomes a node; remove such vertices (trimesh: mesh.remove_unreferenced_vertices())"
         )
-    _, index, place = np.unique(vertices + 0.0, axis=0, return_index=True, return_inverse=True)
-    first_there = index[place.reshape(-1)]
-    repeated = first_there != np.arange(len(vertices))
-    if repeated.any():
-        second = int(np.argmax(repeated))
+    if (found := find_repeated(vertices + 0.0)) is not None:
+        first, second, count = found
         raise ValueError(
-            f"{where}: mesh vertices {first_there[second]} and {second} are at the same place, "
-            f"{vertices[second].tolist()} ({np.count_nonzero(repeated)} vertices repeat another's place); merge them "
+            f"{where}: mesh vertices {first} and {second} are at the same place, "
+            f"{vertices[second].tolist()} ({count} vertices repeat another's place); merge them "
             "(trimesh: mesh.merge_vertices()) or, where the cloth is slit, move them apart"
         )
     corners = np.sort(triangles, axis=1)
-    _, index, place = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-    first_there = index[place.reshape(-1)]
-    repeated = first_there != np.arange(len(triangles))
-    if repeated.any():
-        second = int(np.argmax(repeated))
+    if (found := find_repeated(corners)) is not None:
+        first, second, _ = found
         raise ValueError(
-            f"{where}: mesh triangles {first_there[second]} and {second} have the same corners, "
+            f"{where}: mesh triangles {first} and {second} have the same corners, "
             f"{corners[second].tolist()}; remove one (trimesh: mesh.update_faces(mesh.unique_faces()))"
         )
     edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    if (count > 2).any():
-        first = int(np.argmax(count > 2))
+    unique, faces_at = np.unique(edges, axis=0, return_counts=True)
+    if (faces_at > 2).any():
+        first = int(np.argmax(faces_at > 2))
         raise ValueError(
-            f"{where}: the mesh is not a sheet: {count[first]} triangles meet at the edge of vertices "
-            f"{unique[first].tolist()} ({np.count_nonzero(count > 2)} such edges), and a cloth has at most two there; "
-            "remove the others, or add them as a cloth of their own"
+            f"{where}: the mesh is not a sheet: {faces_at[first]} triangles meet at the edge of vertices "
+            f"{unique[first].tolist()} ({np.count_nonzero(faces_at > 2)} such edges), and a cloth has at most two "
+            "there; remove the others, or add them as a cloth of their own"
         )
 
 

@@ -226,3 +226,14 @@ def is_flat(volume: float, vertices: FloatArray) -> bool:
     """Whether the volume [m³] a closed mesh encloses, of either sign, is no more than rounding."""
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     return not abs(volume) > _FLAT_VOLUME * diagonal**3
+
+
+def find_repeated(rows: NDArray[Any]) -> tuple[int, int, int] | None:
+    """A row and the first that repeats one before it, by index, and how many do; None if none does."""
+    _, index, group = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    first_there = index[group.reshape(-1)]
+    repeated = first_there != np.arange(len(rows))
+    if not repeated.any():
+        return None
+    second = int(np.argmax(repeated))
+    return int(first_there[second]), second, int(np.count_nonzero(repeated))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._mass_properties import FloatArray, IntArray, mesh_mass_properties
-from ._mesh import edge_defects, edge_numbers, face_components, is_flat
+from ._mesh import edge_defects, edge_numbers, face_components, find_repeated, is_flat
 from ._mesh_queries import winding_number
 from ._surfaces import Crossing, Solid, candidate_pairs, inset_points, meeting_faces, touching_depth
 
@@ -64,16 +64,13 @@ def _refuse_repeated_faces(vertices: FloatArray, faces: IntArray, where: str) ->
     In the opposite sense they cancel, as where two boxes share a wall.
     """
     corners = _places(vertices)[faces]
-    first = np.argmin(corners, axis=1)[:, None]
-    corners = np.take_along_axis(corners, (first + np.arange(3)) % 3, axis=1)  # the smallest first, the sense kept
-    _, index, group = np.unique(_row_numbers(corners), return_index=True, return_inverse=True)
-    first_there = index[group]
-    repeated = first_there != np.arange(len(faces))
-    if repeated.any():
-        second = int(np.argmax(repeated))
+    smallest = np.argmin(corners, axis=1)[:, None]
+    corners = np.take_along_axis(corners, (smallest + np.arange(3)) % 3, axis=1)  # which comes first, the sense kept
+    if (found := find_repeated(_row_numbers(corners))) is not None:
+        first, second, count = found
         raise ValueError(
-            f"{where}: mesh faces {first_there[second]} and {second} are the same "
-            f"({np.count_nonzero(repeated)} of {len(faces)} faces repeat another), so that what they enclose would "
+            f"{where}: mesh faces {first} and {second} are the same "
+            f"({count} of {len(faces)} faces repeat another), so that what they enclose would "
             "count twice; keep one of each (trimesh: mesh.merge_vertices(), then "
             "mesh.update_faces(mesh.unique_faces())), or give both mass= and inertia="
         )

@@ -42,7 +42,7 @@ def touched_rooms(files: list[Path]) -> set[str]:
 
 def ctest_names(files: list[Path]) -> str:
     rooms = touched_rooms(files)
-    return "|".join(f"tests/cpp/{room}/" for room in sorted(rooms)) or "test_build_flags"
+    return "|".join(f"tests/cpp/(test_)?{room}[./]" for room in sorted(rooms)) or "test_build_flags"
 
 
 def pytest_files(files: list[Path]) -> list[str]:

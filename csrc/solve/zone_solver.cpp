@@ -179,7 +179,7 @@ private:
     /// Whether the gradient alone says that a Newton step reached the minimum, or came so near that further steps with
     /// the factor at hand reach it. If so, takes the last of them past the tolerance: another factor would only show the
     /// same. The gradient is worth its price where factors are dear, with cloth, and where the line search has it anyway.
-    bool finish_with_this_factor() {
+    bool converge_with_factor() {
         const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
         if (!m_newton.has_factor() || !(with_cloth || (m_newton.is_exact() && m_trial_is_differentiated))) return false;
         const double stiffness = m_work.derivatives.largest_stiffness;  // known only with a Hessian
@@ -270,7 +270,7 @@ private:
                 m_near = m_newton.is_exact() && m_newton_full;
                 accept_trial();
                 const bool is_last = m_result.iterations + 1 >= m_options.max_iterations;
-                if (driven && !is_last && finish_with_this_factor()) {
+                if (driven && !is_last && converge_with_factor()) {
                     ++m_result.iterations;
                     return;
                 }
