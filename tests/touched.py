@@ -17,7 +17,8 @@ from test_layering import ROOMS, reachable_rooms  # noqa: E402
 
 # Of a change in the core: the layer end to end, in seconds. What else there is is slower, or about other things.
 END_TO_END = ("closed_forms", "contacts", "determinism", "failures", "ops", "simulator", "stub")
-ALWAYS = ("layering", "import", "sizes")
+OF_THE_LAYER = ("import", "python_layering", "simulator", "state")
+ALWAYS = ("layering", "sizes")
 
 
 def changed_files() -> list[Path]:
@@ -51,7 +52,7 @@ def pytest_files(files: list[Path]) -> list[str]:
         if file.parts[0] == "csrc":
             names.update(END_TO_END)
         elif file.parts[0] == "diffsim":
-            names.update((file.stem.lstrip("_"), "simulator", "state"))
+            names.update((file.stem.lstrip("_"), *OF_THE_LAYER))
         elif file.parts[:2] == ("tests", "python") and file.stem.startswith("test_"):
             names.add(file.stem.removeprefix("test_"))
     paths = (Path("tests/python") / f"test_{name}.py" for name in sorted(names))
