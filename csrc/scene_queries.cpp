@@ -88,10 +88,6 @@ SceneState separate_state(
 
 namespace {
 
-bool yields(const Model& model, int object) {
-    return object != kGround && (model.is_cloth(object) || model.bodies[object].is_dynamic());
-}
-
 Pose pose_of(const BodyState& body) { return {quaternion_to_matrix(body.orientation), body.position}; }
 
 /// An object where a state has it, relative to some origin.
@@ -150,10 +146,10 @@ public:
     NearestObjects run() {
         const int count = m_model.body_count() + m_model.cloth_count();
         for (int a = 0; a < count; ++a) {
-            if (m_model.ground.present && yields(m_model, a)) measure_ground(a);
+            if (m_model.ground.present && m_model.yields(a)) measure_ground(a);
             if (m_model.is_cloth(a)) measure_self(a);
             for (int b = a + 1; b < count; ++b)
-                if (yields(m_model, a) || yields(m_model, b)) measure_pair(a, b);
+                if (m_model.yields(a) || m_model.yields(b)) measure_pair(a, b);
         }
         return m_nearest;
     }
@@ -245,7 +241,7 @@ CrossingObjects find_crossing(const Model& model, const SceneState& state) {
     for (int c = 0; c < model.cloth_count(); ++c) pairs.emplace_back(model.body_count() + c, model.body_count() + c);
     if (cloth_count > 0) std::sort(pairs.begin(), pairs.end());
     for (const auto& [a, b] : pairs) {
-        if (!yields(model, a) && !yields(model, b)) continue;
+        if (!model.yields(a) && !model.yields(b)) continue;
         if (a == b ? crosses_itself(meshes[a]) : meshes_cross(meshes[a], meshes[b])) return {a, b};
     }
     return {};

@@ -131,12 +131,6 @@ struct Angle {
 
 }  // namespace
 
-template <class A, class B>
-Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, const A& a, const B& b) {
-    return relative_row(
-        motion_of(a, geometry.closest.a.point), motion_of(b, geometry.closest.b.point), geometry.normal);
-}
-
 double contact_energy(const ContactGeometry& geometry, const ContactLaw& law) {
     if (!(law.range.rest - geometry.distance > 0.0)) return 0.0;
     const double energy = normal_force(law, geometry.distance).energy;
@@ -307,9 +301,8 @@ Mat6 GroundSums::hessian(bool with_curvature) const {
 }
 
 // The pairs of sides there are.
-#define DIFFSIM_INSTANTIATE(A, B)                                                                       \
-    template Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry&, const A&, const B&); \
-    template ContactDerivatives<A::kSize + B::kSize> contact_derivatives(                               \
+#define DIFFSIM_INSTANTIATE(A, B)                                         \
+    template ContactDerivatives<A::kSize + B::kSize> contact_derivatives( \
         const ContactGeometry&, const ContactLaw&, const A&, const B&, bool, bool);
 DIFFSIM_INSTANTIATE(BodySide, BodySide)
 DIFFSIM_INSTANTIATE(BodySide, ClothSide)

@@ -22,10 +22,6 @@ struct ContactDerivatives : ContactForce<N> {
     Square<N> hessian;
 };
 
-/// Derivative of the distance.
-template <class A, class B>
-Vector<A::kSize + B::kSize> distance_gradient(const ContactGeometry& geometry, const A& a, const B& b);
-
 /// Energy of a contact: mollifier times potential of the compression below the rest distance.
 double contact_energy(const ContactGeometry& geometry, const ContactLaw& law);
 

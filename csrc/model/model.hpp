@@ -49,6 +49,8 @@ struct Model {
     // Objects are the bodies, then the cloths, or kGround.
     bool is_cloth(int object) const { return object >= body_count(); }
     const Cloth& cloth_of(int object) const { return cloths[object - body_count()]; }
+    /// Whether forces move it: a dynamic body or a cloth.
+    bool yields(int object) const { return object >= 0 && (is_cloth(object) || bodies[object].is_dynamic()); }
     double margin(int object) const { return is_cloth(object) ? cloth_of(object).margin : bodies[object].margin; }
     double own_thickness(int object) const {
         return object_thickness.empty() ? thickness : object_thickness[static_cast<std::size_t>(object)];

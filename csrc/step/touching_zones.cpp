@@ -12,13 +12,9 @@ int to_offsets(std::vector<int>& sizes) {
     return sum;
 }
 
-bool yields(const Model& model, int object) {
-    return object >= 0 && (model.is_cloth(object) || model.bodies[object].is_dynamic());
-}
-
 /// The object by which a contact's zone is found.
 int yielding_object(const Model& model, const Contact& contact) {
-    return yields(model, contact.object_a) ? contact.object_a : contact.object_b;
+    return model.yields(contact.object_a) ? contact.object_a : contact.object_b;
 }
 
 template <class Visit>
@@ -50,7 +46,7 @@ void ZoneFinder::unite(
         }
     }
     for_each_contact(lists, [&](const Contact& c, const ContactList&, int) {
-        const bool a_yields = yields(model, c.object_a), b_yields = yields(model, c.object_b);
+        const bool a_yields = model.yields(c.object_a), b_yields = model.yields(c.object_b);
         if (a_yields) m_zone_of[c.object_a] = 0;
         if (b_yields) m_zone_of[c.object_b] = 0;
         if (a_yields && b_yields) m_touching.unite(c.object_a, c.object_b);

@@ -72,7 +72,8 @@ struct Situation {
     template <class A>
     Derivatives derivatives_with(const ContactGeometry& g, const A& a, bool with_curvature) const {
         const auto d = contact_derivatives(g, law(), a, side_b(g), true, with_curvature);
-        CHECK(d.row == distance_gradient(g, a, side_b(g)));
+        const ClothSide b = side_b(g);
+        CHECK(d.row == relative_row(motion_of(a, g.closest.a.point), motion_of(b, g.closest.b.point), g.normal));
         return {d.gradient, d.row, d.hessian};
     }
     Derivatives derivatives(bool with_curvature = true) const {
