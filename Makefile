@@ -34,7 +34,7 @@ BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 # As pyproject.toml lists them under dev, and what mypy reads the types of.
 LINT_TOOLS := clang-format mypy ruff torch numpy trimesh
 # As pyproject.toml lists them under docs.
-DOCS_TOOLS := furo myst-parser sphinx
+DOCS_TOOLS := furo myst-nb sphinx
 SOURCES := pyproject.toml CMakeLists.txt \
            $(shell find csrc diffsim -type f ! -path '*/__pycache__/*' ! -name '_core*.so')
 CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')

@@ -8,7 +8,7 @@ project = "diffsim"
 copyright = "the diffsim contributors"
 release = metadata.version("mesh-diffsim")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns: list[str] = []
 html_theme = "furo"
 html_title = "diffsim"
@@ -16,6 +16,8 @@ html_show_sourcelink = False
 
 default_role = "code"  # docstrings write `code` as Markdown does
 myst_heading_anchors = 3
+myst_enable_extensions = ["dollarmath"]
+nb_execution_mode = "off"  # notebooks are committed with their outputs; `docs/notebooks` is a link to them
 # Links to files that are not pages, such as ../examples/throw_bunny.py, are links to the repository's files.
 suppress_warnings = ["myst.xref_missing"]
 
@@ -62,6 +64,12 @@ def _restore_attribute(app: Any, what: str, name: str, obj: object, options: Any
         lines[:] = _attributes[name]
 
 
+def _link_to_pages(app: Any, name: str, source: list[str]) -> None:
+    """Notebooks are pages here; in the repository they lie beside the examples."""
+    source[0] = source[0].replace("](../examples/notebooks/", "](notebooks/")
+
+
 def setup(app: Any) -> None:
+    app.connect("source-read", _link_to_pages)
     app.connect("autodoc-process-docstring", _to_restructured_text, priority=400)  # before napoleon's
     app.connect("autodoc-process-docstring", _restore_attribute, priority=600)
