@@ -75,15 +75,40 @@ def test_what_cannot_be_recorded_is_refused(fall: tuple[ds.Simulator, ds.State],
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("package", "file", "extra"),
+    [
+        ("k3d", "a.html", "viewer"),
+        ("rerun", "a.rrd", "rerun"),
+        ("imageio_ffmpeg", "a.mp4", "viewer"),
+        ("matplotlib", "a.webp", "viewer"),
+    ],
+)
 def test_a_missing_package_is_named_with_the_command_that_mends_it(
-    fall: tuple[ds.Simulator, ds.State], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    package: str,
+    file: str,
+    extra: str,
+    fall: tuple[ds.Simulator, ds.State],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    class Absent:
+        @staticmethod
+        def find_spec(name: str, *_: Any) -> None:
+            if name == package:
+                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
     sim, trajectory = fall
-    monkeypatch.setitem(sys.modules, "k3d", None)
-    with pytest.raises(ModuleNotFoundError, match=r"viewer.record needs k3d.*pip install 'mesh-diffsim\[viewer\]'"):
-        ds.viewer.record(sim, trajectory, tmp_path / "a.html")
-    with pytest.raises(ModuleNotFoundError, match=r"viewer.show needs k3d"):
-        ds.viewer.show(sim, trajectory)
+    for loaded in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setattr(sys, "meta_path", [Absent, *sys.meta_path])
+    mend = rf"needs {package}, which is not installed: pip install 'mesh-diffsim\[{extra}\]'"
+    with pytest.raises(ModuleNotFoundError, match=mend):
+        ds.viewer.record(sim, trajectory, tmp_path / file)
+    assert not list(tmp_path.iterdir())
+    if package in ("k3d", "matplotlib"):
+        with pytest.raises(ModuleNotFoundError, match=mend):
+            ds.viewer.show(sim, trajectory) if package == "k3d" else ds.viewer.picture(sim, trajectory)
 
 
 @BROWSER
