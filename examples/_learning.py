@@ -9,7 +9,6 @@ would need many more episodes than either gets here.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -19,12 +18,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, save_figure
+from _stage import FloatArray, make_parser, needed, present, save_figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
 import diffsim as ds
 from diffsim.viewer import Camera, Item, draw_items
+
+gymnasium = needed("gymnasium", "rl")
 
 HIDDEN = (50, 200)
 CLIP = 1.0  # of the norm of a gradient
@@ -73,6 +74,27 @@ class Learning:
 
 
 Distance = Callable[[Any], Tensor]  # from a Moment to the distance from the target, over that at the start, (B,)
+
+
+def make_task(sim: ds.Simulator, steps: int, actions: int, **functions: Any) -> tuple[Any, Distance]:
+    """Bring body 0 from its start to a goal in so many steps, by actions between -1 and 1; and what part of the
+    distance is left. `functions`: the task's `sample`, `control` and `observation`.
+    """
+    start = sim.initial_state().position[0]
+
+    def left(moment: Any) -> Tensor:
+        whole = (moment.goal - start).norm(dim=-1)
+        return (moment.goal - moment.state.position[:, 0]).norm(dim=-1) / whole
+
+    task = ds.interop.gymnasium.Task(
+        simulator=sim,
+        reward=lambda before, action, after: left(before) - left(after),
+        action_space=gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32),
+        steps=steps,
+        terminates_in_time=True,
+        **functions,
+    )
+    return task, left
 
 
 def play(task: Any, act: Callable[[Tensor], Tensor], moment: Any) -> tuple[list[Any], bool]:
@@ -127,8 +149,7 @@ def by_gradient(task: Any, left: Distance, seeds: Sequence[int], episodes: int, 
 
 def by_ddpg(task: Any, left: Distance, seeds: Sequence[int], episodes: int) -> Learning | None:
     """None where stable-baselines3 is missing, which is said."""
-    if importlib.util.find_spec("stable_baselines3") is None:
-        print('stable-baselines3 is not installed (pip install "mesh-diffsim[rl]"): DDPG is left out')
+    if not present("stable_baselines3", "rl", "DDPG"):
         return None
     from stable_baselines3 import DDPG
     from stable_baselines3.common.callbacks import BaseCallback

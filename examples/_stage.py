@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import ipctk
 import numpy as np
-import pymeshfix  # type: ignore[import-untyped]
 import torch
 import trimesh
 from numpy.typing import NDArray
@@ -18,6 +17,25 @@ from numpy.typing import NDArray
 import diffsim as ds
 
 FloatArray = NDArray[np.float64]
+
+
+def needed(package: str, extra: str = "examples") -> Any:
+    """The package; where it is missing, the program ends with a line that says how to get it."""
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        raise SystemExit(f'{error.name} is not installed: pip install "mesh-diffsim[{extra}]"') from None
+
+
+def present(package: str, extra: str, otherwise: str) -> bool:
+    """Whether a package is there; where it is missing, it is said what is left out, and how to get it."""
+    if importlib.util.find_spec(package) is not None:
+        return True
+    print(f'{package} is not installed (pip install "mesh-diffsim[{extra}]"): {otherwise} is left out')
+    return False
+
+
+ipctk, pymeshfix = needed("ipctk"), needed("pymeshfix")
 
 
 # ---- meshes ----------------------------------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ Without stable-baselines3 (`pip install "mesh-diffsim[rl]"`) PPO is left out, an
 from __future__ import annotations
 
 import csv
-import importlib.util
 import math
 import sys
 import time
@@ -31,17 +30,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, report, save_figure
-from gymnasium.vector import AutoresetMode
+from _stage import FloatArray, make_parser, needed, present, report, save_figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
 import diffsim as ds
 from diffsim.interop.gymnasium import Moment, Task, VectorEnv
 from diffsim.viewer import Camera, Item, draw_items
+
+gymnasium = needed("gymnasium", "rl")
 
 SIDE, FLOOR, RIM, WALL = 0.6, 0.02, 0.08, 0.02  # of the tray: inside; thickness, height and thickness of the rim [m]
 RADIUS, MASS, GRAVITY = 0.05, 0.1, 9.81  # of the ball [m], [kg], [m/s²]
@@ -275,7 +274,7 @@ def by_ppo(task: Task, seed: int, steps: int) -> Curve:
         """Our episodes as stable-baselines3 wants them."""
 
         def __init__(self) -> None:
-            self.env = VectorEnv(task, EPISODES, AutoresetMode.SAME_STEP)
+            self.env = VectorEnv(task, EPISODES, gymnasium.vector.AutoresetMode.SAME_STEP)
             super().__init__(EPISODES, self.env.single_observation_space, self.env.single_action_space)
 
         def reset(self) -> Any:
@@ -462,9 +461,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     trained = [by_short_horizons(task, seed, windows) for seed in seeds]
     ours = [curve for curve, *_ in trained]
     ppo: list[Curve] = []
-    if importlib.util.find_spec("stable_baselines3") is None:
-        print('stable-baselines3 is not installed (pip install "mesh-diffsim[rl]"): PPO is left out')
-    elif not options.quick:
+    if not options.quick and present("stable_baselines3", "rl", "PPO"):
         ppo = [by_ppo(task, seed, PPO_STEPS * windows * HORIZON * EPISODES) for seed in seeds]
     if not options.no_picture:
         groups = [ours, ppo] if ppo else [ours]

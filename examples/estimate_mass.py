@@ -33,14 +33,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _stage import make_parser, report, save_figure
-from scipy import stats
+from _stage import make_parser, needed, report, save_figure
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 from tqdm import tqdm
 
 import diffsim as ds
 from diffsim.viewer import Camera, Item, draw_items
+
+stats = needed("scipy.stats")
 
 F64 = torch.float64
 

@@ -24,15 +24,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cma  # type: ignore[import-untyped]
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, make_parser, report, save_figure
+from _stage import FloatArray, Judge, make_parser, needed, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
 import diffsim as ds
 from diffsim.viewer import Camera, Item, draw_items
+
+cma = needed("cma")
 
 LENGTH, WIDTH, HEIGHT = 0.8, 0.1, 1.0  # of the strip, and of its clamp over the ground [m]
 NODES, QUICK_NODES = (33, 5), (17, 3)  # along and across

@@ -19,10 +19,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from _learning import Learning, Program, draw_moments, findings, play, test_starts
+from _learning import Learning, Program, draw_moments, findings, make_task, play, test_starts
 from _stage import report
 from torch import Tensor
 
@@ -80,24 +79,7 @@ def build_task() -> tuple[Any, Any]:
         tilt = torch.stack([state.orientation[:, 0, 2], state.angular_velocity[:, 0, 1]], dim=-1)
         return torch.cat([way, state.velocity[:, 0, [0, 2]], tilt, moment.time_left[:, None]], dim=-1)
 
-    def reward(before: Any, action: Tensor, after: Any) -> Tensor:
-        return distance_left(before) - distance_left(after)
-
-    def distance_left(moment: Any) -> Tensor:
-        whole = (moment.goal - rest.position[0]).norm(dim=-1)
-        return (moment.goal - moment.state.position[:, 0]).norm(dim=-1) / whole
-
-    task = ds.interop.gymnasium.Task(
-        simulator=sim,
-        sample=sample,
-        control=control,
-        observation=observation,
-        reward=reward,
-        action_space=gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32),
-        steps=STEPS,
-        terminates_in_time=True,
-    )
-    return task, distance_left
+    return make_task(sim, STEPS, 3, sample=sample, control=control, observation=observation)
 
 
 APART = 5.5  # of the pictures of one motion [m]

@@ -25,15 +25,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cma  # type: ignore[import-untyped]
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, make_parser, report, save_figure
+from _stage import FloatArray, Judge, make_parser, needed, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
 import diffsim as ds
 from diffsim.viewer import Camera, Item, draw_items
+
+cma = needed("cma")
 
 SIDE, NODES, MIDDLE = 1.0, 9, (-0.52, 0.50)  # of the sheet [m]
 STRETCHED = 1.05  # times its length at rest

@@ -25,15 +25,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, report, save_figure
+from _stage import FloatArray, make_parser, needed, report, save_figure
 from torch import Tensor
 from tqdm import tqdm
 
 import diffsim as ds
 from diffsim.viewer import Camera, Item, draw_items
+
+mujoco = needed("mujoco")
 
 HALF_SIZES = (0.25, 0.2, 0.1)  # [m]
 STARTS = (-1.0, 0.0, 1.0)  # x of the centres [m]

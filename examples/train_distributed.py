@@ -27,6 +27,7 @@ import torch.distributed
 from _stage import make_parser, report, save_figure
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
+from tqdm import tqdm
 
 import diffsim as ds
 
@@ -154,7 +155,7 @@ def train(share: Share, iterations: int, seed: int = 0) -> Training:
     optimiser = torch.optim.Adam(policy.network.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
     training = Training(policy, share, seed, torch.empty(0))
-    for iteration in range(iterations):
+    for iteration in tqdm(range(iterations), desc="training", unit="iteration", disable=share.rank > 0):
         target = share.part(targets(SCENES, seed=first_scenes(seed) + iteration))
         optimiser.zero_grad()
         loss = squared_distance(module(target), target)
@@ -164,8 +165,9 @@ def train(share: Share, iterations: int, seed: int = 0) -> Training:
         optimiser.step()
         schedule.step()
         training.losses.append(float(share.mean(loss)))
-        if share.rank == 0 and (iteration % 50 == 0 or iteration == iterations - 1):
-            print(f"iteration {iteration:4d}: root of the mean squared distance {training.losses[-1] ** 0.5:.4f} m")
+    if share.rank == 0:
+        ends = (f"{loss**0.5:.4f} m" for loss in (training.losses[0], training.losses[-1]))
+        print(f"root of the mean squared distance: {' to '.join(ends)}")
     return training
 
 

@@ -14,12 +14,11 @@ Implicit Euler takes energy out of the bounce, in proportion to the step: on 11 
 36, 52 and 62 % of its height at steps of 10, 5, 2.5 and 1.25 ms. MuJoCo's comes to 66 % at 1 ms and 75 % at 0.2 ms.
 
 Writes out/trampoline.png and checks itself: the exit code says whether all that `check` looks at holds. Without mujoco
-(`pip install mujoco`) that part is left out, and the program says so.
+(`pip install "mesh-diffsim[mujoco]"`) that part is left out, and the program says so.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import sys
 import time
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _stage import FloatArray, Judge, make_parser, report, save_figure, shift
+from _stage import FloatArray, Judge, make_parser, present, report, save_figure, shift
 from tqdm import tqdm
 
 import diffsim as ds
@@ -214,8 +213,7 @@ def fall_in_mujoco(name: str, xml: str, dt: float, speed: float, duration: float
 
 def peers(nodes: int, dt: float, speed: float, duration: float, aside: float = ASIDE) -> list[Peer]:
     """The flex with a small step of its own, and the net with ours; none without mujoco."""
-    if importlib.util.find_spec("mujoco") is None:
-        print("mujoco is not installed: its ball is left out (pip install mujoco)")
+    if not present("mujoco", "mujoco", "its ball"):
         return []
     flex, net = flex_xml(nodes, FLEX_DT, aside), net_xml(NET_NODES, dt, aside)
     return [

@@ -296,10 +296,39 @@ def test_learn_sticks_fails_without_training(capsys: pytest.CaptureFixture[str])
 def test_trampoline_leaves_mujoco_out_where_it_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    trampoline = load("trampoline")
-    monkeypatch.setattr(trampoline.importlib.util, "find_spec", lambda name: None)
-    assert trampoline.peers(5, 0.01, 0.0, 0.1) == []
-    assert "mujoco is not installed" in capsys.readouterr().out
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert load("trampoline").peers(5, 0.01, 0.0, 0.1) == []
+    told = 'mujoco is not installed (pip install "mesh-diffsim[mujoco]"): its ball is left out\n'
+    assert capsys.readouterr().out == told
+
+
+def test_learning_leaves_ddpg_out_where_stable_baselines_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("gymnasium", reason="pip install .[examples]")
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    assert load("_learning").by_ddpg(None, lambda moment: moment, [0], 1) is None
+    told = 'stable_baselines3 is not installed (pip install "mesh-diffsim[rl]"): DDPG is left out\n'
+    assert capsys.readouterr().out == told
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"),
+    [
+        ("learn_sticks", "gymnasium", "rl"),
+        ("mujoco_interop", "mujoco", "examples"),
+        ("marble_inverse", "cma", "examples"),
+        ("estimate_mass", "scipy.stats", "examples"),
+    ],
+)
+def test_an_example_ends_with_a_line_where_a_package_is_missing(
+    name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, "_learning", raising=False)
+    with pytest.raises(SystemExit) as end:
+        load(name)
+    assert str(end.value) == f'{package} is not installed: pip install "mesh-diffsim[{extra}]"'
 
 
 def test_judge_of_the_cloth_examples_sees_what_overlaps() -> None:
