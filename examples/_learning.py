@@ -329,7 +329,7 @@ class Program:
     episodes: int
     quick_episodes: int
     rate: float
-    seeds: int = 2  # by default; curves of five take --seeds 5
+    seeds: int = 5  # by default
 
     def main(
         self,

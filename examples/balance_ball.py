@@ -51,7 +51,7 @@ DT, STEPS = 0.04, 48  # [s]
 EPISODES, HORIZON = 32, 16  # at a time; steps through which gradients go
 DISCOUNT, MIX = 0.99, 0.95  # of later rewards; of longer and shorter estimates of what a state is worth
 RATE, CRITIC_RATE, CRITIC_UPDATES = 1e-2, 2e-3, 8
-WINDOWS, QUICK_WINDOWS, PPO_STEPS, SEEDS = 60, 40, 4, 2
+WINDOWS, QUICK_WINDOWS, PPO_STEPS, SEEDS = 60, 40, 4, 5
 TESTS, LAST = 64, 12  # episodes nothing was trained on, and their steps that count
 EVERY = 6  # windows from test to test
 

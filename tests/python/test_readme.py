@@ -38,6 +38,15 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", [README, ROOT / "docs" / "gallery.md"], ids=lambda page: page.name)
+def test_every_example_is_shown_with_its_picture_and_command(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    names = sorted(path.stem for path in (ROOT / "examples").glob("[a-z]*.py"))
+    assert len(names) > 10
+    assert [name for name in names if f"`python examples/{name}.py`" not in text] == []
+    assert [name for name in names if not re.search(rf"\]\(\S*images/{name}\.(png|webp)\)", text)] == []
+
+
 def test_cited_papers_are_in_the_bibliography() -> None:
     keys = set(re.findall(r"@\w+\{(\w+),", (ROOT / "docs" / "references.bib").read_text(encoding="utf-8")))
     cited = {key for page in PAGES for key in re.findall(r"\[([a-z]+\d{4}[a-z]+)\]", page.read_text(encoding="utf-8"))}
