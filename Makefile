@@ -1,5 +1,5 @@
 # make demo       throw the bunny (examples/throw_bunny.py)
-# make examples   all examples, each of which checks itself; pictures in out/
+# make examples   all examples, two at a time, each of which checks itself; pictures, results and what they say in out/
 # make notebooks  run examples/notebooks/*.py and write them to .ipynb with their outputs
 # make test       C++ and Python tests, the latter against the installed package
 # make check      after a change: what it touches is compiled and tested, the rest and all that is slow is left out
@@ -37,6 +37,7 @@ LINT_TOOLS := clang-format mypy ruff torch numpy trimesh
 DOCS_TOOLS := furo myst-nb sphinx
 SOURCES := pyproject.toml CMakeLists.txt \
            $(shell find csrc diffsim -type f ! -path '*/__pycache__/*' ! -name '_core*.so')
+EXAMPLES ?= $(sort $(notdir $(basename $(wildcard examples/[a-z]*.py))))
 CXX_FILES = $(shell find csrc tests/cpp -name '*.[ch]pp')
 
 .PHONY: demo examples notebooks test test-cpp test-python check sanitize lint format docs bench report clean
@@ -46,7 +47,9 @@ demo: $(VENV)/.with-examples
 	$(BIN)/python examples/throw_bunny.py
 
 examples: $(VENV)/.with-examples $(VENV)/.with-rl
-	@for script in $(sort $(wildcard examples/[a-z]*.py)); do echo $$script; $(BIN)/python $$script || exit 1; done
+	@mkdir -p out && printf '%s\n' $(EXAMPLES) | OMP_NUM_THREADS=1 xargs -P 2 -I NAME sh -c \
+	    '$(BIN)/python examples/NAME.py > out/NAME.log 2>&1; code=$$?; \
+	    grep "^FAIL " out/NAME.log; echo "NAME: $$(tail -n 1 out/NAME.log)"; exit $$code'
 
 notebooks: $(VENV)/.with-notebooks
 	$(BIN)/python examples/notebooks/execute.py

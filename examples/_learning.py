@@ -59,6 +59,11 @@ class Curve:
     seconds: list[float] = field(default_factory=list)  # of the processor
     tests: FloatArray = field(default_factory=lambda: np.empty(0))  # the same in the test episodes, after training
 
+    def before(self, seconds: float) -> float:
+        """What was left in the last AVERAGE episodes until then, on the average."""
+        count = max(int(np.searchsorted(self.seconds, seconds)), 1)
+        return float(np.mean(self.left[max(count - AVERAGE, 0) : count]))
+
 
 @dataclass
 class Learning:
@@ -235,7 +240,9 @@ def findings(
         results.append((text, found <= error))
     if ddpg is not None:
         listed = ", ".join(f"{100.0 * t:.0f}" for t in ddpg.tests)
-        text = f"DDPG leaves {listed} % of the distance after as many episodes"
+        text = f"DDPG leaves {listed} % of the distance after as many episodes,"
+        early = (d.before(o.seconds[-1]) for d, o in zip(ddpg.curves, ours.curves))
+        text += f" and {', '.join(f'{100.0 * x:.0f}' for x in early)} % in training after as many seconds"
         results.append((text, bool(np.median(ddpg.tests) > np.median(ours.tests))))
     return results
 

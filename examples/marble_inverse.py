@@ -112,15 +112,15 @@ def make_problem(table: Table, seed: int) -> Problem:
 class Search:
     name: str
     objectives: list[float] = field(default_factory=list)  # one per simulation
-    seconds: list[float] = field(default_factory=list)  # when it was known
+    seconds: list[float] = field(default_factory=list)  # of the processor, when it was known
     best: Tensor = field(default_factory=lambda: torch.zeros(STEPS, 2, dtype=torch.float64))  # unknowns
-    begin: float = field(default_factory=time.perf_counter)
+    begin: float = field(default_factory=time.process_time)
 
     def note(self, unknowns: Tensor, objective: float, seconds: float | None = None) -> None:
         if not self.objectives or objective < min(self.objectives):
             self.best = unknowns.detach().clone()
         self.objectives.append(objective)
-        self.seconds.append(time.perf_counter() - self.begin if seconds is None else seconds)
+        self.seconds.append(time.process_time() - self.begin if seconds is None else seconds)
 
     @property
     def falling(self) -> FloatArray:
@@ -174,10 +174,10 @@ def by_cma(problem: Problem, budget: int, seed: int, tell: Callable[[int], objec
     while len(search.objectives) < budget:
         asked = strategy.ask()
         unknowns = torch.tensor(np.array(asked)).reshape(-1, STEPS, 2).transpose(0, 1)
-        before = time.perf_counter() - search.begin
+        before = time.process_time() - search.begin
         with torch.no_grad():
             objectives = problem.objective(unknowns.contiguous()).tolist()
-        after = time.perf_counter() - search.begin
+        after = time.process_time() - search.begin
         strategy.tell(asked, objectives)
         count = min(len(objectives), budget - len(search.objectives))
         for index in range(count):
@@ -279,10 +279,11 @@ def draw(table: Table, trials: Sequence[Trial], path: Path) -> None:
         goal = camera.project([*trial.problem.target.tolist(), height])
         left.plot(goal[0], goal[1], "x", ms=9, mew=2, color="0.1", zorder=6)
         left.set_title("the marble's way to the cross, after descent", fontsize=10, color="0.2")
-        for axes, over in ((middle, "simulations"), (right, "seconds")):
+        for axes, over in ((middle, "simulations"), (right, "seconds of the processor")):
             for k, color in enumerate(("#d9601a", "#2e7d32", "#1f5fa8")):
-                curve(axes, [t.searches[k] for t in trials], color, over == "seconds")
+                curve(axes, [t.searches[k] for t in trials], color, axes is right)
             axes.set(xlabel=over, xscale="log", yscale="log")
+            axes.tick_params(axis="x", which="minor", labelbottom=False)
         middle.set_ylabel("objective [m²], mean ± one standard deviation")
         middle.legend(frameon=False, fontsize=9)
 
