@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, needed, present, save_figure
+from _stage import FloatArray, make_parser, needed, of_seeds, present, save_figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -302,7 +302,7 @@ def draw_curves(axes: Any, learning: Learning, over_seconds: bool) -> None:
     if over_seconds:
         x = np.mean([c.seconds for c in learning.curves], axis=0)[AVERAGE - 1 :]
     mean, deviation = values.mean(axis=0), values.std(axis=0)
-    axes.plot(x, mean, color=color, lw=1.8, label=learning.name)
+    axes.plot(x, mean, color=color, lw=1.8, label=of_seeds(learning.name, len(learning.curves)))
     axes.fill_between(x, np.maximum(mean - deviation, 0.05), mean + deviation, color=color, alpha=0.2, lw=0.0)
 
 
@@ -317,9 +317,7 @@ def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], 
             axes.set(xlabel=label, ylabel="distance left at the end [%]", yscale="log", ylim=(0.1, 300.0))
             axes.grid(True, alpha=0.3)
         episodes.legend(frameon=False)
-        count = len(learnings[0].curves)
-        title = f"mean and standard deviation of {count} seeds" if count > 1 else "one seed"
-        seconds.set_title(title, fontsize=10, color="0.2")
+        seconds.set_title("mean and standard deviation", fontsize=10, color="0.2")
 
     save_figure(path, fill, figsize=(13.0, 4.2))
 

@@ -185,6 +185,11 @@ def point_triangle_distance(point: FloatArray, triangles: FloatArray) -> FloatAr
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
+def of_seeds(name: str, count: int) -> str:
+    """The label of a curve."""
+    return f"{name}, {count} seeds" if count > 1 else f"{name}, one seed"
+
+
 def save_figure(path: Path, draw: Callable[[Any], None], **layout: Any) -> None:
     """Make a figure, let `draw(figure)` fill it, write it."""
     import matplotlib

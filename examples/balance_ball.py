@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, needed, present, report, save_figure
+from _stage import FloatArray, make_parser, needed, of_seeds, present, report, save_figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -402,7 +402,7 @@ def draw_curves(axes: Any, curves: Sequence[Curve], over: str) -> None:
     held = 1e3 * np.array([c.held for c in curves])
     x = np.mean([getattr(c, over) for c in curves], axis=0)
     mean, deviation, color = held.mean(axis=0), held.std(axis=0), COLORS[curves[0].name]
-    axes.plot(x, mean, color=color, lw=1.8, label=curves[0].name)
+    axes.plot(x, mean, color=color, lw=1.8, label=of_seeds(curves[0].name, len(curves)))
     axes.fill_between(x, np.maximum(mean - deviation, 1.0), mean + deviation, color=color, alpha=0.2, lw=0.0)
 
 
@@ -430,9 +430,7 @@ def draw(task: Task, actor: Actor, groups: Sequence[Sequence[Curve]], path: Path
             axes.set(xlabel=label, ylabel="distance held in test episodes [mm]", yscale="log")
             axes.grid(True, alpha=0.3)
         steps.legend(frameon=False)
-        count = len(groups[0])
-        text = f"mean and standard deviation of {count} seeds" if count > 1 else "one seed"
-        seconds.set_title(text, fontsize=10, color="0.2")
+        seconds.set_title("mean and standard deviation", fontsize=10, color="0.2")
 
     save_figure(path, fill, figsize=(13.0, 4.2))
 
