@@ -428,6 +428,7 @@ def draw(task: Task, actor: Actor, groups: Sequence[Sequence[Curve]], path: Path
                 draw_curves(axes, curves, over)
             axes.axhline(1e3 * HELD, color="0.6", lw=1.0, ls="--")
             axes.set(xlabel=label, ylabel="distance held in test episodes [mm]", yscale="log")
+            axes.locator_params(axis="x", nbins=5)
             axes.grid(True, alpha=0.3)
         steps.legend(frameon=False)
         seconds.set_title("mean and standard deviation", fontsize=10, color="0.2")
