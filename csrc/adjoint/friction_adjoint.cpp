@@ -7,10 +7,10 @@
 namespace diffsim {
 namespace {
 
-constexpr double kSpring = 10.0;           // of sticking contacts, times their own: much stiffer ones cost digits
-constexpr double kGive = 1e-2;             // of the springs' inverse: what slips give for their multipliers
+constexpr double kSpring = 100.0;          // of sticking contacts, times their own: much stiffer ones cost digits
+constexpr double kGive = 0.1;              // of the springs' inverse: what slips give for their multipliers
 constexpr int kRounds = 3;                 // each leaves about kGive / kSpring of what slips give
-constexpr double kLinearTolerance = 1e-9;  // of a round
+constexpr double kLinearTolerance = 1e-8;  // of a round
 constexpr int kMaxLinear = 60;
 
 }  // namespace
@@ -84,8 +84,8 @@ FrictionAdjoint::Unknowns FrictionAdjoint::preconditioned(
         const Term& term = m_terms[k];
         if (!term.sticks) continue;
         result.multipliers[k] =
-            -term.spring * (term.rows.transpose() * gather(m_zone, term, x.z)) - (1.0 - give) * x.multipliers[k];
-        scatter(m_zone, term, -1.0, SmallVector(term.slip.transpose() * result.multipliers[k]), result.z);
+            -term.spring * slips_along(term.rows, gather(m_zone, term, x.z)) - (1.0 - give) * x.multipliers[k];
+        scatter(m_zone, term, -1.0, forces_of(term.slip, result.multipliers[k]), result.z);
     }
     system.solve_in_place(result.z);
     add(1.0, x, result);
@@ -112,7 +112,7 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
     for (std::size_t k = 0; k < m_terms.size(); ++k) {
         Term& term = m_terms[k];
         if (term.sticks)
-            term.multiplier = x.multipliers[k] + term.spring * (term.rows.transpose() * gather(m_zone, term, z));
+            term.multiplier = x.multipliers[k] + term.spring * slips_along(term.rows, gather(m_zone, term, z));
     }
     return true;
 }

@@ -35,6 +35,18 @@ struct FrictionTerm {
     }
 };
 
+/// Products with what has a row per coordinate of a term, of a size the compiler knows where bodies alone take part.
+inline Eigen::Vector2d slips_along(const TangentRows& rows, const SmallVector& x) {
+    if (x.size() == 6) return rows.topRows<6>().transpose().lazyProduct(x.head<6>());
+    if (x.size() == 12) return rows.topRows<12>().transpose().lazyProduct(x.head<12>());
+    return rows.transpose().lazyProduct(x);
+}
+inline SmallVector forces_of(const SlipChanges& slip, const Eigen::Vector2d& multiplier) {
+    if (slip.cols() == 6) return slip.leftCols<6>().transpose().lazyProduct(multiplier);
+    if (slip.cols() == 12) return slip.leftCols<12>().transpose().lazyProduct(multiplier);
+    return slip.transpose().lazyProduct(multiplier);
+}
+
 /// Overwrite a term. `contact`: index into Zone::contacts.
 void make_friction_term(
     const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
