@@ -73,6 +73,7 @@ bool FrictionAdjoint::factorize(BlockSystem& system) {
     }
     return system.factorize();
 }
+
 /// P⁻¹ A x, with A the system and P the upper triangle of blocks S, Cᵀ, -1/spring, S the system that is factorized.
 FrictionAdjoint::Unknowns FrictionAdjoint::preconditioned(
     const BlockSystem& system, const Unknowns& x, double give) const {
