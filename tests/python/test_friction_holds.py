@@ -167,7 +167,7 @@ def test_what_rests_takes_no_iteration() -> None:
 
 @pytest.mark.parametrize("count", [12, 20])
 def test_layers_of_cubes_come_to_rest_in_few_models(count: int) -> None:
-    """Slips of what sticks are all that is left: by springs as soft as before, 12 take 15 models and 20 keep 2e-9 m/s."""
+    """Only slips of what sticks are left: with springs as soft as elsewhere 12 take 15 models, and 20 keep 2e-9 m/s."""
     sim = ds.Simulator(scenes.two_layer_stack(count), DT)
     with torch.no_grad():
         sim.friction.fill_(0.5)
