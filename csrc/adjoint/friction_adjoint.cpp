@@ -7,10 +7,10 @@
 namespace diffsim {
 namespace {
 
-constexpr double kSpring = 100.0;          // of sticking contacts, times their own: much stiffer ones cost digits
-constexpr double kGive = 0.1;              // of the springs' inverse: what slips give for their multipliers
+constexpr double kSpring = 10.0;           // of sticking contacts, times their own: much stiffer ones cost digits
+constexpr double kGive = 0.01;             // of the springs' inverse: what slips give for their multipliers
 constexpr int kRounds = 3;                 // each leaves about kGive / kSpring of what slips give
-constexpr double kLinearTolerance = 1e-8;  // of a round
+constexpr double kLinearTolerance = 1e-9;  // of a round
 constexpr int kMaxLinear = 60;
 
 }  // namespace
