@@ -311,14 +311,15 @@ private:
 
     void measure_step() {
         rows_times(m_rows, m_w.step, m_w.slope);
-        slips_times(m_friction, m_rows, m_w.step, m_w.slip_step);
+        slips_times(m_friction, m_rows, m_w.step, m_w.along_step);
+        m_w.slip_step = m_w.along_step;
         m_model.smooth.multiply(m_w.step, m_w.smooth_step);
         add_turns(m_w.step, m_w.slip_step, m_w.smooth_step);
         m_first = dot(m_w.step, m_model.gradient) + dot(m_w.step, m_w.smooth_p);
         m_second = dot(m_w.step, m_w.smooth_step);
     }
 
-    /// That of the convex energy whose bounds stay as they are, along the step.
+    /// What is left of the balance along the step, with bounds that stay as they are: without turns the slope of a convex energy.
     double slope(double t, const std::vector<double>& bound) const {
         double sum = m_first + t * m_second;
         for (std::size_t r = 0; r < m_rows.size(); ++r) {
@@ -328,7 +329,7 @@ private:
         for (std::size_t f = 0; f < m_friction.size(); ++f) {
             if (!(bound[f] > 0.0)) continue;
             const Vec2 w = m_w.slip[f] + t * m_w.slip_step[f];
-            sum += bound[f] * w.dot(m_w.slip_step[f]) / std::max(w.norm(), m_friction[f].reach);
+            sum += bound[f] * w.dot(m_w.along_step[f]) / std::max(w.norm(), m_friction[f].reach);
         }
         return sum;
     }

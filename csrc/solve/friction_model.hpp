@@ -29,6 +29,7 @@ struct BalanceWorkspace {
     std::vector<double> violation, slope, bound;
     std::vector<char> pushes;
     std::vector<Vec2> slip, slip_step, pull;
+    std::vector<Vec2> along_step;  // as slip_step, without turns: what forces act along
     SideMatrices turned;
 };
 
