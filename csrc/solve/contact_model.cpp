@@ -54,6 +54,18 @@ void add_node_stiffness(const ContactRow& row, double stiffness, BlockSystem& sy
     }
 }
 
+void set_pushes(ModelWorkspace& w) {
+    w.pushes.resize(w.violation.size());
+    for (std::size_t r = 0; r < w.pushes.size(); ++r) w.pushes[r] = w.violation[r] > 0.0;
+}
+
+/// Those that pushed in the model before, where any did.
+void guess_pushes(const std::vector<ContactRow>& rows, ModelWorkspace& w) {
+    set_pushes(w);
+    if (std::none_of(rows.begin(), rows.end(), [](const ContactRow& row) { return row.force > 0.0; })) return;
+    for (std::size_t r = 0; r < rows.size(); ++r) w.pushes[r] = rows[r].force > 0.0;
+}
+
 }  // namespace
 
 void add_run(
@@ -90,22 +102,6 @@ void add_rows(
         if (any) add_run(rows[first], force, stiffness, gradient, system);
     });
 }
-
-namespace {
-
-void set_pushes(ModelWorkspace& w) {
-    w.pushes.resize(w.violation.size());
-    for (std::size_t r = 0; r < w.pushes.size(); ++r) w.pushes[r] = w.violation[r] > 0.0;
-}
-
-/// Those that pushed in the model before, where any did.
-void guess_pushes(const std::vector<ContactRow>& rows, ModelWorkspace& w) {
-    set_pushes(w);
-    if (std::none_of(rows.begin(), rows.end(), [](const ContactRow& row) { return row.force > 0.0; })) return;
-    for (std::size_t r = 0; r < rows.size(); ++r) w.pushes[r] = rows[r].force > 0.0;
-}
-
-}  // namespace
 
 ModelSolution minimise(
     ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& w, Coordinates& p) {
