@@ -32,7 +32,7 @@ class Failure:
     #: names of the bodies and cloths it is about: what is squeezed and what squeezes it; the pair that penetrates; of a
     #: group that was not solved all, but of a large one only the 8 whose forces balance least
     bodies: tuple[str, ...]
-    #: in one word: "max_iterations", "no_descent", "spinning", "blocked", "penetrating" or "overflow"
+    #: in one word: "max_iterations", "crawls", "no_descent", "spinning", "blocked", "penetrating" or "overflow"
     status: str
     reason: str  #: in a sentence
     iterations: int  #: Newton iterations of the zone that took most

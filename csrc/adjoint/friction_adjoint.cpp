@@ -20,10 +20,12 @@ FrictionAdjoint::FrictionAdjoint(const Zone& zone, const ZonePoint& point, const
     m_terms.reserve(friction.size());
     for (std::size_t k = 0; k < friction.size(); ++k) {
         const ActiveContact& active = point.active[k];
-        if (!(zone.contacts.law(static_cast<std::size_t>(active.index)).friction > 0.0)) continue;
+        const ContactLaw law = zone.contacts.law(static_cast<std::size_t>(active.index));
+        if (!(law.friction > 0.0)) continue;
         if (active.geometry.sine_sq == 0.0) continue;  // parallel edges push nothing
         Term& term = m_terms.emplace_back();
-        make_friction_term(zone, point, active.index, active.geometry, friction[k], term);
+        const double force = contact_force(active.geometry, law);
+        make_friction_term(zone, point, active.index, active.geometry, force, friction[k], term);
         term.contact = active.index;
     }
 }

@@ -144,6 +144,8 @@ const char* failure_text(StepStatus status) {
             return "";
         case StepStatus::too_many_iterations:
             return "max_iterations reached";
+        case StepStatus::crawls:
+            return "no balance of friction was found in 10,000 factorizations";
         case StepStatus::no_descent:
             return "no step lowers the energy";
         case StepStatus::spinning:
@@ -165,6 +167,8 @@ const char* status_text(StepStatus status) {
             return "converged";
         case StepStatus::too_many_iterations:
             return "max_iterations";
+        case StepStatus::crawls:
+            return "crawls";
         case StepStatus::no_descent:
             return "no_descent";
         case StepStatus::spinning:

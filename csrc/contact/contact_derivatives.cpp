@@ -139,6 +139,10 @@ double contact_energy(const ContactGeometry& geometry, const ContactLaw& law) {
     return geometry.sine_sq > 0.0 ? edge_mollifier(geometry.sine_sq).value * energy : 0.0;
 }
 
+double contact_force(const ContactGeometry& geometry, const ContactLaw& law) {
+    return edge_mollifier(geometry.sine_sq).value * normal_force(law, geometry.distance).force;
+}
+
 namespace {
 
 /// The second derivative is added to `hessian`, unless that is null.

@@ -25,6 +25,9 @@ struct ContactDerivatives : ContactForce<N> {
 /// Energy of a contact: mollifier times potential of the compression below the rest distance.
 double contact_energy(const ContactGeometry& geometry, const ContactLaw& law);
 
+/// What it pushes with, along its normal.
+double contact_force(const ContactGeometry& geometry, const ContactLaw& law);
+
 /// `with_curvature` false leaves the second derivative of distance and mollifier out of the Hessian, which is then
 /// stiffness * row rowᵀ. `with_hessian` false leaves the Hessian unset.
 template <class A, class B>

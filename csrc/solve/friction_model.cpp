@@ -18,8 +18,9 @@ constexpr double kFlat = 0.1;         // of the slope at the start: that at the 
 constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
-constexpr double kSlipShare = 0.07;     // of what a bound presses its contact by: FrictionRow::reach
-constexpr double kHoldingShare = 0.03;  // of that, where only slips of sticking contacts are left to end
+constexpr double kColdShare = 0.5;      // of what a bound presses its contact by: FrictionRow::reach
+constexpr double kSlipShare = 0.07;     // the same near the balance
+constexpr double kHoldingShare = 2e-3;  // and where only slips of sticking contacts are left to end
 constexpr double kSettledReach = 0.01;  // of its slip
 constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
 
@@ -89,7 +90,7 @@ private:
 
     /// Proportional to the load: then all contacts of a face come to their bounds together.
     void set_reach() {
-        const double share = kSlipShare * (m_goal.is_balanced ? kHoldingShare : 1.0);
+        const double share = m_goal.is_balanced ? kHoldingShare : m_goal.is_settled ? kSlipShare : kColdShare;
         std::size_t f = 0;
         visit_runs(m_rows, [&](std::size_t first, std::size_t last) {
             double sum = 0.0;

@@ -44,4 +44,6 @@ void ModelDirection::relax() {
     for (double& weight : m_weight) weight = weight > kProximal ? weight / kMoreProximal : 0.0;
 }
 
+void ModelDirection::forget_damping() { std::fill(m_weight.begin(), m_weight.end(), 0.0); }
+
 }  // namespace diffsim

@@ -49,8 +49,7 @@ void ModelDirection::start_from(const ZonePoint& point) {
     m_kept.clear();
     for (const ActiveContact& active : point.active) {
         const ZoneContact& contact = m_zone.contacts[active.index];
-        const double push = normal_force(contact.law, active.geometry.distance).force;
-        const double force = edge_mollifier(active.geometry.sine_sq).value * push;
+        const double force = contact_force(active.geometry, contact.law);
         if (force > 0.0) m_kept.push_back({contact.contact, force, {}});
     }
     sort_kept();

@@ -51,6 +51,8 @@ public:
     void damp(const ZonePoint& trial, double rise);
     /// The way was good: less damping in the next model.
     void relax();
+    /// Damping was of no use.
+    void forget_damping();
 
     /// Whether who pushes at the end of the way was known before the model was solved.
     bool knew_who_pushes() const { return m_right_guess; }

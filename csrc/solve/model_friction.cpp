@@ -21,8 +21,7 @@ void ModelDirection::add_friction_forces(Coordinates& gradient) {
         if (!state.is_known) continue;
         const ZoneContact& contact = m_zone.contacts[active.index];
         const ContactGeometry& geometry = active.geometry;
-        const double force =
-            edge_mollifier(geometry.sine_sq).value * normal_force(contact.law, geometry.distance).force;
+        const double force = contact_force(geometry, contact.law);
         if (!(contact.law.friction * force > 0.0)) continue;
         const ContactRow row = make_row(m_zone, contact, geometry, at, at.y, 0.0);
         FrictionRow slip = make_friction_row(m_zone, contact, geometry, at, at.y);
@@ -84,12 +83,13 @@ void ModelDirection::add_turns() {
     for (std::size_t f = 0; f < m_model.friction.size(); ++f) {
         const FrictionRow& slip = m_model.friction[f];
         const NearContact& near = m_near[slip.normal];
-        if (!slip.is_known || !(m_model.rows[slip.normal].force > 0.0)) continue;
+        const double force = m_model.rows[slip.normal].force;
+        if (!slip.is_known || !(force > 0.0)) continue;
         const FrictionState& state = m_friction[static_cast<std::size_t>(near.contact)];
-        make_friction_term(m_zone, m_point, near.contact, near.geometry, {state.share, false}, term);
-        const std::size_t force = m_model.turns.forces.add(term, term.changes);
+        make_friction_term(m_zone, m_point, near.contact, near.geometry, force, {state.share, false}, term);
+        const std::size_t changes = m_model.turns.forces.add(term, term.changes);
         m_model.turns.slips.push_back(
-            {term.sides, term.side_count, f, force, term.rows, term.slip - term.rows.transpose()});
+            {term.sides, term.side_count, f, changes, term.rows, term.slip - term.rows.transpose()});
     }
 }
 

@@ -11,9 +11,10 @@ constexpr double kSettled = 1e-2;        // residual below which contacts mostly
 constexpr double kTurning = 0.1;         // the same below which models see how contacts turn
 constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are solved
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
-constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is known of the last model's bounds alone
-constexpr double kRest = 1e-12;  // of the forces: a model that moves nothing further has found the balance
-constexpr int kStandsStill = 3;  // models in balance without halving their motion
+constexpr int kMaxDamped = 4;       // models in a row: what friction takes up is known of the last model's bounds alone
+constexpr double kRest = 1e-12;     // of the forces: a model that moves nothing further has found the balance
+constexpr int kMaxFactors = 10000;  // of all models of a step: those that converge have taken up to 7,600
+constexpr int kStandsStill = 3;     // models in balance without halving their motion
 
 class BalanceSearch {
 public:
@@ -29,6 +30,8 @@ public:
                 return m_search.fail(StepStatus::too_many_iterations);
             if (m_search.m_result.iterations == 0 && driven && rests(now)) return;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
+            m_factors += way.newton_steps;
+            if (m_factors > kMaxFactors) return m_search.fail(StepStatus::crawls);
             if (!way.found) return m_search.fail(StepStatus::no_descent);
             const double motion = motion_to_end();
             const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
@@ -100,8 +103,11 @@ private:
     /// Whether energy and what friction takes up rise; then the model is damped.
     bool rises(double step) {
         const double change = m_work.trial.energy - m_work.point.energy + m_model.friction_work(step);
-        if (change <= m_search.current_noise() || m_damped >= kMaxDamped) return false;
-        ++m_damped;
+        if (change <= m_search.current_noise()) return false;
+        if (++m_damped > kMaxDamped) {
+            m_model.forget_damping();
+            return false;
+        }
         m_model.damp(m_work.trial, change);
         return true;
     }
@@ -112,7 +118,7 @@ private:
     Coordinates m_balance;  // what is left of it
     double m_wanted = 0.0;  // the residual asked for
     double m_least_motion = kInfinity;
-    int m_stalls = 0, m_damped = 0, m_still = 0;
+    int m_factors = 0, m_stalls = 0, m_damped = 0, m_still = 0;
 };
 
 }  // namespace

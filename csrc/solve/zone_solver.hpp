@@ -15,6 +15,7 @@ class Interrupt;
 enum class StepStatus {
     converged,
     too_many_iterations,
+    crawls,      ///< of friction: more factorizations than steps that converge take
     no_descent,  ///< the line search found no lower energy
     spinning,    ///< a body turns further than its free motion can be solved for; never of a zone
     blocked,     ///< a driven body cannot reach its target: something is squeezed

@@ -152,11 +152,12 @@ class TermMaker {
 public:
     TermMaker(
         const Zone& zone, const ZonePoint& point, const ZoneContact& contact, const ContactGeometry& geometry,
-        const ContactFriction& friction, FrictionTerm& term)
+        double force, const ContactFriction& friction, FrictionTerm& term)
         : m_zone(zone),
           m_point(point),
           m_geometry(geometry),
           m_contact(contact),
+          m_pushed(force),
           m_friction(friction),
           m_term(term),
           m_frame(friction_frame(geometry, contact.law)) {}
@@ -235,7 +236,7 @@ private:
         const ContactLaw& law = m_contact.law;
         const double mollifier = edge_mollifier(m_geometry.sine_sq).value;
         const PotentialValue push = normal_force(law, m_geometry.distance);
-        const double bound = law.friction * mollifier * push.force, size = m_slip.norm();
+        const double bound = law.friction * m_pushed, size = m_slip.norm();
         m_term.sticks = !(m_friction.slips && size > kRestingSlip);
         m_term.stiffness = mollifier * push.stiffness;
         m_term.symmetric.setZero();
@@ -330,6 +331,7 @@ private:
     const ZonePoint& m_point;
     const ContactGeometry& m_geometry;
     const ZoneContact m_contact;
+    const double m_pushed;  // the contact's own force
     const ContactFriction& m_friction;
     FrictionTerm& m_term;
     FrictionFrame m_frame;
@@ -347,12 +349,12 @@ Side kind(const PlacedSide<Side>&);
 }  // namespace
 
 void make_friction_term(
-    const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
+    const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry, double force,
     const ContactFriction& friction, FrictionTerm& term) {
     with_placed_sides(
         zone, zone.contacts[contact], geometry, point.poses, point.nodes, [&](const auto& a, const auto& b) {
             TermMaker<decltype(kind(a)), decltype(kind(b))>(
-                zone, point, zone.contacts[contact], geometry, friction, term)
+                zone, point, zone.contacts[contact], geometry, force, friction, term)
                 .make(a, b);
         });
 }

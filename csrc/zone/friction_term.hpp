@@ -47,9 +47,9 @@ inline SmallVector forces_of(const SlipChanges& slip, const Eigen::Vector2d& mul
     return slip.transpose().lazyProduct(multiplier);
 }
 
-/// Overwrite a term. `contact`: index into Zone::contacts.
+/// Overwrite a term. `contact`: index into Zone::contacts; `force`: what it pushes with.
 void make_friction_term(
-    const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry,
+    const Zone& zone, const ZonePoint& point, int contact, const ContactGeometry& geometry, double force,
     const ContactFriction& friction, FrictionTerm& term);
 
 }  // namespace diffsim

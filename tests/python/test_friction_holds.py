@@ -165,6 +165,22 @@ def test_what_rests_takes_no_iteration() -> None:
     assert after.velocity.abs().max() == 0.0
 
 
+@pytest.mark.parametrize("friction", [0.5, 1.0])
+def test_bricks_that_land_flush_on_each_other_converge(friction: float) -> None:
+    """Many contacts come to push in one step: with springs as stiff at first as near the balance models crawl, and take
+    factorizations by the ten thousands.
+    """
+    scene = ds.Scene()
+    scene.add_ground(friction=friction)
+    for row in range(5):
+        for k in range(5):
+            position = ((k + 0.5 * (row % 2)) * 0.202, 0.0, 0.05 + 0.1 * row + 1e-3 * (row + 1))
+            scene.add_body(ds.shapes.box((0.2, 0.1, 0.1)), density=500.0, position=position, friction=friction)
+    sim = ds.Simulator(scene, DT, on_failure="raise")
+    end = sim.rollout(sim.initial_state(), steps=10)[-1]
+    assert end.velocity.abs().max() < 0.1  # [m/s], those that overhang by half of their length
+
+
 @pytest.mark.parametrize("count", [12, 20])
 def test_layers_of_cubes_come_to_rest_in_few_models(count: int) -> None:
     """Only slips of what sticks are left: with springs as soft as elsewhere 12 take 15 models, and 20 keep 2e-9 m/s."""

@@ -62,7 +62,9 @@ struct Boxes {
     }
     FrictionTerm term() const {
         FrictionTerm term;
-        make_friction_term(zone, point, point.active.front().index, point.active.front().geometry, state, term);
+        const ActiveContact& active = point.active.front();
+        const double force = contact_force(active.geometry, zone.contacts[active.index].law);
+        make_friction_term(zone, point, active.index, active.geometry, force, state, term);
         return term;
     }
 
