@@ -21,10 +21,14 @@ unexport PYTHONPATH
 
 # Not byte-compiled: Python does that with what is imported, which is a small part of torch, and once.
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile --constraint constraints.txt
-# ON: a folder of C++ is one unit. From nothing that takes about half as long; after a change in one file, longer.
+# ON: a folder of the core is one unit. From nothing that takes less; after a change in one file, longer. A folder of tests
+# always is: they are most of what is compiled, mostly for headers that changed.
 UNITY ?= OFF
-CONFIGURE := $(BIN)/cmake -S . -G Ninja "-DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python" \
-             -DDIFFSIM_BUILD_PYTHON=OFF -DDIFFSIM_BUILD_TESTS=ON -DDIFFSIM_WERROR=ON -DCMAKE_UNITY_BUILD=$(UNITY)
+TREE := DIFFSIM_BUILD_TESTS=ON DIFFSIM_WERROR=ON DIFFSIM_LTO=OFF DIFFSIM_PRECOMPILE=ON DIFFSIM_GROUP_TESTS=ON \
+        CMAKE_UNITY_BUILD=$(UNITY) $(if $(shell command -v ccache),CMAKE_CXX_COMPILER_LAUNCHER=ccache)
+export CCACHE_SLOPPINESS := pch_defines,time_macros
+CONFIGURE := $(BIN)/cmake -S . -G Ninja "-DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python" -DDIFFSIM_BUILD_PYTHON=OFF \
+             $(TREE:%=-D%)
 CTEST := $(BIN)/ctest --output-on-failure --parallel 2 --test-dir
 # One thread of torch and BLAS for each worker: they share the processors.
 PYTEST := OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/pytest --numprocesses auto --dist worksteal
@@ -131,8 +135,6 @@ $(VENV)/.with-%: $(SOURCES) $(VENV)/.build-tools
 # In one tree with the C++ tests, and without link-time optimization, which takes long and changes no bit.
 $(VENV)/.with-test: $(SOURCES) $(shell find tests/cpp -type f) $(VENV)/.build-tools
 	$(INSTALL) --no-build-isolation --config-settings=build-dir=build/test \
-	    --config-settings=cmake.define.DIFFSIM_LTO=OFF --config-settings=cmake.define.DIFFSIM_BUILD_TESTS=ON \
-	    --config-settings=cmake.define.DIFFSIM_WERROR=ON --config-settings=cmake.define.CMAKE_UNITY_BUILD=$(UNITY) \
-	    $(if $(shell command -v ccache),--config-settings=cmake.define.CMAKE_CXX_COMPILER_LAUNCHER=ccache) ".[test]"
+	    $(TREE:%=--config-settings=cmake.define.%) ".[test]"
 	@rm -f $(VENV)/.with-*
 	@touch $@

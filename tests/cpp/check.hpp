@@ -197,14 +197,8 @@ public:
         constexpr double kUnit = 1.0 / 9007199254740992.0;  // 2⁻⁵³
         return low + (high - low) * static_cast<double>(m_engine() >> 11) * kUnit;
     }
-    Eigen::VectorXd vector(Eigen::Index size, double low = -1.0, double high = 1.0) {
-        return matrix(size, 1, low, high);
-    }
-    Eigen::MatrixXd matrix(Eigen::Index rows, Eigen::Index cols, double low = -1.0, double high = 1.0) {
-        Eigen::MatrixXd result(rows, cols);
-        for (double& entry : result.reshaped()) entry = uniform(low, high);
-        return result;
-    }
+    Eigen::VectorXd vector(Eigen::Index size, double low = -1.0, double high = 1.0);
+    Eigen::MatrixXd matrix(Eigen::Index rows, Eigen::Index cols, double low = -1.0, double high = 1.0);
 
 private:
     std::mt19937_64 m_engine;

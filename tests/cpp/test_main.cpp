@@ -58,6 +58,14 @@ void fail(Location where, const std::string& what) {
     throw Failure(out.str());
 }
 
+Eigen::VectorXd Random::vector(Eigen::Index size, double low, double high) { return matrix(size, 1, low, high); }
+
+Eigen::MatrixXd Random::matrix(Eigen::Index rows, Eigen::Index cols, double low, double high) {
+    Eigen::MatrixXd result(rows, cols);
+    for (double& entry : result.reshaped()) entry = uniform(low, high);
+    return result;
+}
+
 }  // namespace check
 
 int main(int argument_count, char** arguments) {

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,24 @@ def load(name: str) -> ModuleType:
     sys.modules[name] = module  # dataclasses look it up there
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _figures_repaired_once() -> Iterator[None]:
+    """To close the scan of the bunny takes seconds, and five tests begin with it."""
+    stage = importlib.import_module("_stage")
+    found: dict[bytes, Any] = {}
+    repair = stage.repaired
+
+    def repaired(mesh: Any) -> Any:
+        key = mesh.vertices.tobytes() + mesh.faces.tobytes()
+        if key not in found:
+            found[key] = repair(mesh)
+        return found[key].copy()
+
+    stage.repaired = repaired
+    yield
+    stage.repaired = repair
 
 
 @pytest.fixture(scope="module")

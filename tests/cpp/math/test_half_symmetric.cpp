@@ -13,24 +13,24 @@ template <int N>
 void check_sums(check::Random& random) {
     static_assert(N >= 6);
     HalfSymmetric<N> sum;
-    Square<N> plain = Square<N>::Zero();
+    MatrixX plain = MatrixX::Zero(N, N);
     for (int k = 0; k < 5; ++k) {
-        const Vector<N> row = random.vector(N), column = random.vector(N);
+        const VectorX row = random.vector(N), column = random.vector(N);
         const Vec3 part = random.vector(3);
         const Mat3 block = random.matrix(3, 3);
         const double factor = random.uniform(-1.0, 1.0);
-        sum.add_square(factor, row);
+        sum.add_square(factor, Vector<N>(row));
         plain += factor * row * row.transpose();
-        sum.template add_outer<3, 3>(column, part);
-        Vector<N> full = Vector<N>::Zero();
-        full.template segment<3>(3) = part;
+        sum.template add_outer<3, 3>(Vector<N>(column), part);
+        VectorX full = VectorX::Zero(N);
+        full.segment<3>(3) = part;
         plain += column * full.transpose() + full * column.transpose();
         sum.template block<3, 3>(0, N - 3) += block;
-        plain.template topRightCorner<3, 3>() += block;
-        plain.template bottomLeftCorner<3, 3>() += block.transpose();
+        plain.topRightCorner<3, 3>() += block;
+        plain.bottomLeftCorner<3, 3>() += block.transpose();
     }
     CHECK(plain.norm() > 1.0);
-    CHECK_NEAR(sum.whole(), plain, 1e-14);
+    CHECK_NEAR(MatrixX(sum.whole()), plain, 1e-14);
     sum.set_zero();
     CHECK(sum.whole().isZero(0.0));
 }

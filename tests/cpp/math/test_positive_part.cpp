@@ -9,23 +9,23 @@ using namespace diffsim;
 
 namespace {
 
-/// S = A - B with A, B positive semidefinite on spaces normal to each other: A is the positive part.
+/// S = A - B with A, B positive semidefinite on spaces normal to each other: A is the positive part. Only what is tested has a
+/// fixed size: five of each would take the compiler longest of all.
 template <int N>
 void check_size() {
     using Matrix = Eigen::Matrix<double, N, N>;
     check::Random random(N);
-    Matrix any;
-    for (int j = 0; j < N; ++j) any.col(j) = random.vector(N);
-    const Matrix axes = Eigen::SelfAdjointEigenSolver<MatrixX>(any + any.transpose()).eigenvectors();
-    Matrix A = Matrix::Zero(), B = Matrix::Zero();
+    const MatrixX any = random.matrix(N, N);
+    const MatrixX axes = Eigen::SelfAdjointEigenSolver<MatrixX>(any + any.transpose()).eigenvectors();
+    MatrixX A = MatrixX::Zero(N, N), B = A;
     for (int k = 0; k < N; ++k) {
-        const Matrix part = random.uniform(0.1, 3.0) * axes.col(k) * axes.col(k).transpose();
+        const MatrixX part = random.uniform(0.1, 3.0) * axes.col(k) * axes.col(k).transpose();
         (k % 3 == 0 ? B : A) += part;
     }
-    const Matrix S = A - B;
-    CHECK_NEAR(positive_part<N>(S), A, 1e-13);
-    CHECK_NEAR(positive_part<N>(A), A, 1e-13);
-    CHECK_NEAR(positive_part<N>(-A), Matrix(Matrix::Zero()), 1e-13);
+    const auto positive = [](const MatrixX& matrix) { return MatrixX(positive_part<N>(Matrix(matrix))); };
+    CHECK_NEAR(positive(A - B), A, 1e-13);
+    CHECK_NEAR(positive(A), A, 1e-13);
+    CHECK_NEAR(positive(-A), MatrixX(MatrixX::Zero(N, N)), 1e-13);
 }
 
 }  // namespace

@@ -3,44 +3,28 @@
 #include <algorithm>
 #include <array>
 
-#include "fixtures.hpp"
-#include "solve/zone_solver.hpp"
+#include "solve_fixtures.hpp"
 #include "zone/zone_accuracy.hpp"
 
 namespace test_newton_direction {
 
 using namespace diffsim;
+using namespace fixtures::solve;
 
 namespace {
 
-constexpr double kHalf = 0.05;       // edge of the cube, half [m]
-constexpr double kThickness = 1e-4;  // [m]
-constexpr double kFall = 9.8e-4;     // of a step [m]
-constexpr double kPush = 1e-8;       // into the ground, of the 1e-7 or so that it is compressed by at rest [m]
+constexpr double kPush = 1e-8;  // into the ground, of the 1e-7 or so that it is compressed by at rest [m]
 
-/// A cube of 1 kg that rests on the ground, pushed down from where it rests.
-struct Pushed {
-    Model model;
-    std::vector<ClothParameters> materials;
-    ZoneWorkspace workspace;
-    std::vector<Box> swept;
-    Zone zone;
+/// A cube that rests on the ground, pushed down from where it rests.
+struct Pushed : Cubes {
     ZonePoint point;
     ZoneDerivatives derivatives;
     BlockSystem system;
     NewtonDirection newton;
 
-    explicit Pushed(double push) {
-        model.thickness = kThickness;
-        model.ground = {true, 0.0, 0.5 * kThickness};
-        const Vec3 half = Vec3::Constant(kHalf);
-        model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
-        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
-        const Pose start{Mat3::Identity(), Vec3(0.0, 0.0, kHalf + kThickness * (1.0 - 1e-5))};  // just touching
-        zone.bodies.push_back(fixtures::zone_body(0, start, 1.0, fixtures::box_inertia(half, 1.0)));
-        zone.bodies[0].target[5] = -kFall;
-        zone.dynamic_count = 1;
-        CHECK(solve_zone(zone, PassiveBodies(), {}, workspace, swept).status == StepStatus::converged);
+    explicit Pushed(double push) : Cubes(true) {
+        add(Vec3(0.0, 0.0, kTouching));
+        CHECK(solve().status == StepStatus::converged);
         point.y = workspace.point.y;
         point.y.bodies[0][5] -= push;
         evaluate(zone, point);

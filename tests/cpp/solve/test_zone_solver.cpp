@@ -3,43 +3,22 @@
 #include <algorithm>
 
 #include "cloth_fixtures.hpp"
-#include "fixtures.hpp"
+#include "solve_fixtures.hpp"
 
 namespace test_zone_solver {
 
 using namespace diffsim;
+using namespace fixtures::solve;
 
 namespace {
 
-constexpr double kHalf = 0.05;       // edge of the cubes, half [m]
-constexpr double kThickness = 1e-4;  // [m]
-constexpr double kFall = 9.8e-4;     // of a step [m]
-constexpr double kGap = 3e-4;        // between the cubes: within reach of lists for the fall, out of it at rest [m]
+constexpr double kGap = 3e-4;  // between the cubes: within reach of lists for the fall, out of it at rest [m]
 
-/// Two cubes of 1 kg side by side, that would fall if nothing held them.
-struct Cubes {
-    Model model;
-    std::vector<ClothParameters> materials;
-    PassiveBodies nobody;
-    ZoneWorkspace workspace;
-    std::vector<Box> swept;
-    Zone zone;
-
-    explicit Cubes(bool on_ground) {
-        model.thickness = kThickness;
-        if (on_ground) model.ground = {true, 0.0, 0.5 * kThickness};
-        const Vec3 half = Vec3::Constant(kHalf);
-        for (int i = 0; i < 2; ++i) model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
-        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
-        const double height = kHalf + kThickness * (1.0 - 1e-5);  // just touching
-        for (int i = 0; i < 2; ++i) {
-            const Pose pose{Mat3::Identity(), Vec3(i * (2.0 * kHalf + kGap), 0.0, height)};
-            zone.bodies.push_back(fixtures::zone_body(i, pose, 1.0, fixtures::box_inertia(half, 1.0)));
-            zone.bodies.back().target[5] = -kFall;
-        }
-        zone.dynamic_count = 2;
+/// Two cubes side by side, that would fall if nothing held them.
+struct Pair : Cubes {
+    explicit Pair(bool on_ground) : Cubes(on_ground) {
+        for (int i = 0; i < 2; ++i) add(Vec3(i * (2.0 * kHalf + kGap), 0.0, kTouching));
     }
-    ZoneResult solve() { return solve_zone(zone, nobody, {}, workspace, swept); }
     int listed_pairs() const {
         int count = 0;
         for (const ZoneContact& contact : zone.contacts) count += contact.contact.with_ground() ? 0 : 1;
@@ -55,12 +34,12 @@ struct Cubes {
 }  // namespace
 
 TEST(bodies_held_by_something_list_no_neighbours_that_only_falling_would_bring_near) {
-    Cubes held(true);
+    Pair held(true);
     CHECK(held.solve().status == StepStatus::converged);
     CHECK(held.workspace.point.active.size() == 8);  // four vertices each, on the ground
     CHECK(held.listed_pairs() == 0);
 
-    Cubes falling(true);
+    Pair falling(true);
     for (ZoneBody& body : falling.zone.bodies)
         body.last_motion[5] = -kFall;  // as if it had moved so far in the last step
     CHECK(falling.solve().status == StepStatus::converged);
@@ -69,7 +48,7 @@ TEST(bodies_held_by_something_list_no_neighbours_that_only_falling_would_bring_n
 
 TEST(a_body_that_seems_held_meets_its_neighbour_all_the_same) {
     // Pushed aside on the ground: three times the gap, which is short of a tenth of its radius.
-    Cubes pushed(true);
+    Pair pushed(true);
     pushed.zone.bodies[0].target[3] = 3.0 * kGap;
     CHECK(pushed.solve().status == StepStatus::converged);
     CHECK(pushed.touching_pairs() > 0);
@@ -78,14 +57,14 @@ TEST(a_body_that_seems_held_meets_its_neighbour_all_the_same) {
     CHECK(y.bodies[1][3] > 0.5 * kGap);  // the neighbour is taken along
     for (const double distance : pushed.workspace.point.distances) CHECK(distance > 0.9 * 0.5 * kThickness);
     // Without anything that holds it, too: it was at rest in the air.
-    Cubes released(false);
+    Pair released(false);
     released.zone.bodies[0].target[3] = 3.0 * kGap;
     CHECK(released.solve().status == StepStatus::converged);
     CHECK(released.touching_pairs() > 0);
 }
 
 TEST(a_press_finds_in_few_steps_that_it_squeezes_a_pile) {
-    Cubes pile(true);
+    Pair pile(true);
     const double pitch = 2.0 * kHalf + kThickness;
     pile.zone.bodies[1].start.t = pile.zone.bodies[0].start.t + Vec3(0.0, 0.0, pitch);
     pile.model.bodies.push_back(
