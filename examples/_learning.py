@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, needed, of_seeds, present, save_figure
+from _stage import FloatArray, make_parser, needed, of_seeds, present, save_figure, weight_errors
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -30,6 +30,10 @@ gymnasium = needed("gymnasium", "rl")
 HIDDEN = (50, 200)
 CLIP = 1.0  # of the norm of a gradient
 TESTS = 32  # episodes nothing was trained on
+TESTED, CHOSEN = 10_000, 20_000  # where the draws of the episodes that are tested on begin; and of those of a choice
+CHOOSING = range(10, 15)  # seeds on which a rate is chosen; tests are on others
+RATES = (1e-3, 2e-3, 3e-3, 5e-3, 1e-2)
+BALANCE = 1e-3  # what the forces on the object may be off, of its weight
 AVERAGE = 10  # episodes a point of a curve is the mean of
 
 
@@ -111,20 +115,23 @@ def play(task: Any, act: Callable[[Tensor], Tensor], moment: Any) -> tuple[list[
     return moments, converged
 
 
-def test_starts(task: Any) -> Any:
-    return task.start(*(np.random.default_rng(10_000 + i) for i in range(TESTS)))
+def held_out_starts(task: Any, drawn: int = TESTED) -> Any:
+    """Of episodes nothing was trained on."""
+    return task.start(*(np.random.default_rng(drawn + i) for i in range(TESTS)))
 
 
-def test(task: Any, act: Callable[[Tensor], Tensor], left: Distance) -> FloatArray:
-    """What is left of the distance in episodes nothing was trained on."""
+def left_over(task: Any, act: Callable[[Tensor], Tensor], left: Distance, drawn: int = TESTED) -> FloatArray:
+    """What is left of the distance in such episodes."""
     with torch.no_grad():
-        return np.asarray(left(play(task, act, test_starts(task))[0][-1]).numpy())
+        return np.asarray(left(play(task, act, held_out_starts(task, drawn))[0][-1]).numpy())
 
 
 # ---- through the physics ---------------------------------------------------------------------------------------------
 
 
-def by_gradient(task: Any, left: Distance, seeds: Sequence[int], episodes: int, rate: float) -> Learning:
+def by_gradient(
+    task: Any, left: Distance, seeds: Sequence[int], episodes: int, rate: float, drawn: int = TESTED
+) -> Learning:
     learning = Learning("through the physics")
     first = task.observation(task.start(np.random.default_rng(0)))
     for seed in seeds:
@@ -143,10 +150,21 @@ def by_gradient(task: Any, left: Distance, seeds: Sequence[int], episodes: int, 
             schedule.step()
             curve.left.append(loss.item() ** 0.5)
             curve.seconds.append(time.process_time() - begin)
-        curve.tests = test(task, controller, left)
+        curve.tests = left_over(task, controller, left, drawn)
         learning.curves.append(curve)
         learning.controllers.append(controller)
     return learning
+
+
+def choose_rate(task: Any, left: Distance, episodes: int) -> None:
+    """Print what each rate leaves, on seeds and targets that nothing is tested on."""
+    means = {}
+    for rate in RATES:
+        tests = by_gradient(task, left, CHOOSING, episodes, rate, CHOSEN).tests
+        means[rate] = tests.mean()
+        listed = ", ".join(f"{100.0 * t:.2f}" for t in tests)
+        print(f"rate {rate:g}: {100.0 * means[rate]:.2f} % of the distance left on the average, {listed}", flush=True)
+    print(f"the least is left by rate {min(means, key=means.__getitem__):g}")
 
 
 # ---- beside it -------------------------------------------------------------------------------------------------------
@@ -189,7 +207,7 @@ def by_ddpg(task: Any, left: Distance, seeds: Sequence[int], episodes: int) -> L
                 model.predict(observation.numpy().astype(np.float32), deterministic=True)[0]
             ).double()
 
-        curve.tests = test(task, act, left)
+        curve.tests = left_over(task, act, left)
         learning.curves.append(curve)
     return learning
 
@@ -220,10 +238,28 @@ def gradient_error(task: Any, controller: Controller, left: Distance) -> float:
     return abs((values[0] - values[1]) / (2.0 * nudge) / expected - 1.0)
 
 
+def weight_error(task: Any, controller: Controller, mass: float, gravity: float) -> float:
+    """Of body 0 in a test episode: what its contacts do beyond its weight and its gain of momentum, over its weight."""
+    with torch.no_grad():
+        moments, _ = play(task, controller, held_out_starts(task)[:1])
+        drives = {
+            k: task.control(controller(task.observation(moment)), moment)[0] for k, moment in enumerate(moments[:-1])
+        }
+        states = [moment.state[0] for moment in moments]
+        return weight_errors(task.simulator, states, drives, {0: mass}, gravity)[0]
+
+
 def findings(
-    task: Any, left: Distance, ours: Learning, ddpg: Learning | None, reach: float, error: float
+    task: Any,
+    left: Distance,
+    ours: Learning,
+    ddpg: Learning | None,
+    reach: float,
+    error: float,
+    mass: float,
+    gravity: float,
 ) -> list[tuple[str, bool]]:
-    """What must hold, in words, and whether it does."""
+    """What must hold, in words, and whether it does. `mass` [kg] and `gravity` [m/s²] are what body 0 shall have."""
     listed = ", ".join(f"{100.0 * t:.1f}" for t in ours.tests)
     results = [
         (
@@ -233,11 +269,14 @@ def findings(
     ]
     text = f"{ours.failed_episodes} episodes had a step that did not converge"
     results.append((text, ours.failed_episodes == 0))
-    fresh = Controller(task.observation(test_starts(task)).shape[1], task.action_space.shape[0], 0)
+    fresh = Controller(task.observation(held_out_starts(task)).shape[1], task.action_space.shape[0], 0)
     for name, controller in (("first", fresh), ("learned", ours.controllers[0])):
         found = gradient_error(task, controller, left)
         text = f"gradient of an episode by the {name} controller: {found:.1e} off central differences"
         results.append((text, found <= error))
+    off = weight_error(task, ours.controllers[0], mass, gravity)
+    text = f"what carries it bears its weight and speeds it up, to {off:.1e} of its weight"
+    results.append((text, off <= BALANCE))
     if ddpg is not None:
         listed = ", ".join(f"{100.0 * t:.0f}" for t in ddpg.tests)
         text = f"DDPG leaves {listed} % of the distance after as many episodes,"
@@ -274,7 +313,7 @@ def draw_moments(
 ) -> None:
     """The motion to a test target at its start, middle and end, side by side. `looks`: of each object, see `Item`."""
     with torch.no_grad():
-        moments, _ = play(task, ours.controllers[0], test_starts(task)[:1])
+        moments, _ = play(task, ours.controllers[0], held_out_starts(task)[:1])
     items, marks, dt = [], [], task.simulator.dt * task.substeps
     shown = (0, task.steps // 2, task.steps)
     for place, index in enumerate(shown):
@@ -347,9 +386,14 @@ class Program:
         parser = make_parser(self.description, quick, "the first")
         parser.add_argument("--seeds", type=int, default=self.seeds, help="how many (default: %(default)s)")
         parser.add_argument("--episodes", type=int, default=self.episodes, help="of each (default: %(default)s)")
+        text = f"instead, only say what other rates leave on seeds {CHOOSING[0]} to {CHOOSING[-1]}, and other targets"
+        parser.add_argument("--choose-rate", action="store_true", help=text)
         options = parser.parse_args(argv)
         begin = time.perf_counter()
         task, left = build_task()
+        if options.choose_rate:
+            choose_rate(task, left, options.episodes)
+            return 0
         seeds = range(options.seed, options.seed + (1 if options.quick else options.seeds))
         episodes = min(options.episodes, self.quick_episodes) if options.quick else options.episodes
         ours = by_gradient(task, left, seeds, episodes, self.rate)

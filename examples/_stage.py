@@ -95,7 +95,11 @@ def report(results: Iterable[tuple[str, bool]]) -> bool:
 
 
 def weight_errors(
-    sim: ds.Simulator, states: Sequence[ds.State], drives: Mapping[int, ds.Control], masses: Mapping[int, float]
+    sim: ds.Simulator,
+    states: Sequence[ds.State],
+    drives: Mapping[int, ds.Control],
+    masses: Mapping[int, float],
+    gravity: float = 9.81,
 ) -> dict[int, float]:
     """Of bodies over some steps: the impulse of their contacts less that of gravity less the momentum they gained, over
     their weight's impulse.
@@ -105,6 +109,7 @@ def weight_errors(
         states: All of them.
         drives: What drove steps that follow each other, by the number of the state they were taken from.
         masses: Of those bodies [kg]; not the simulator's, which is what is judged.
+        gravity: Downwards [m/s²]; likewise.
     """
     first, last = min(drives), max(drives) + 1
     impulse = torch.zeros(len(sim.body_names), 3, dtype=torch.float64)
@@ -112,7 +117,7 @@ def weight_errors(
         impulse += sim.dt * sim.contacts(states[step], control).net_force()
     errors = {}
     for body, mass in masses.items():
-        weight = torch.tensor([0.0, 0.0, mass * 9.81 * sim.dt * len(drives)], dtype=torch.float64)
+        weight = torch.tensor([0.0, 0.0, mass * gravity * sim.dt * len(drives)], dtype=torch.float64)
         gained = mass * (states[last].velocity[body] - states[first].velocity[body])
         errors[body] = float((impulse[body] - weight - gained).norm() / weight.norm())
     return errors

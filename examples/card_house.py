@@ -350,9 +350,11 @@ def draw(throw: Throw, search: Search, falls: Sequence[ds.State], path: Path) ->
             axes.set_title(title, fontsize=10, color="0.2")
         axes = grid[-1]
         axes.axhline(1e3 * ASIDE, color="0.6", lw=1.0, ls="--")
-        for way in search.ways:
-            axes.plot(range(1, len(way.aside) + 1), 1e3 * np.array(way.aside), "o-", lw=1.6, ms=4)
+        for way, name in zip(search.ways, ("first at the house", "first beside it")):
+            axes.plot(range(1, len(way.aside) + 1), 1e3 * np.array(way.aside), "o-", lw=1.6, ms=4, label=name)
         axes.set(xlabel="throw", ylabel="the top is aside by [mm]")
+        axes.locator_params(axis="x", integer=True)
+        axes.legend(frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.06))
         axes.set_title("by gradients; dashed: wanted", fontsize=10, color="0.2")
 
     save_figure(path, fill, figsize=(16.0, 3.6))

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _learning import Learning, Program, draw_moments, findings, make_task, play, test_starts
+from _learning import Learning, Program, draw_moments, findings, held_out_starts, make_task, play
 from _stage import Judge, report
 from torch import Tensor
 
@@ -79,9 +79,9 @@ def build_task() -> tuple[Any, Any]:
 
 def check(task: Any, left: Any, ours: Learning, ddpg: Learning | None) -> bool:
     """Print what must hold and whether it does."""
-    results = findings(task, left, ours, ddpg, REACH, GRADIENT_ERROR)
+    results = findings(task, left, ours, ddpg, REACH, GRADIENT_ERROR, MASS, GRAVITY)
     with torch.no_grad():
-        moments, _ = play(task, ours.controllers[0], test_starts(task))
+        moments, _ = play(task, ours.controllers[0], held_out_starts(task))
         starts = moments[0]
         middle = starts.state.position[:1, 0] + torch.tensor([0.0, 0.0, 0.5 * (LOW + HIGH)], dtype=torch.float64)
         blind = (starts.goal - middle).norm(dim=-1) / (starts.goal - starts.state.position[:, 0]).norm(dim=-1)

@@ -15,13 +15,14 @@ Without stable-baselines3 (`pip install "mesh-diffsim[rl]"`) DDPG is left out, a
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from _learning import Learning, Program, draw_moments, findings, make_task, play, test_starts
+from _learning import Learning, Program, draw_moments, findings, held_out_starts, make_task, play
 from _stage import report
 from torch import Tensor
 
@@ -89,9 +90,9 @@ APART = 5.5  # of the pictures of one motion [m]
 
 def check(task: Any, left: Any, ours: Learning, ddpg: Learning | None) -> bool:
     """Print what must hold and whether it does."""
-    results = findings(task, left, ours, ddpg, REACH, GRADIENT_ERROR)
+    results = findings(task, left, ours, ddpg, REACH, GRADIENT_ERROR, DENSITY * math.prod(BLOCK), GRAVITY)
     with torch.no_grad():
-        moments, _ = play(task, ours.controllers[0], test_starts(task)[:1])
+        moments, _ = play(task, ours.controllers[0], held_out_starts(task)[:1])
     lowest = min(task.simulator.min_distance(moment.state).item() for moment in moments)
     results.append((f"block and sticks never come nearer than {lowest:.1e} m beyond their margins", lowest > -1e-3))
     return report(results)

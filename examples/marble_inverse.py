@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, make_parser, needed, report, save_figure
+from _stage import FloatArray, Judge, make_parser, needed, report, save_figure, weight_errors
 from torch import Tensor
 from tqdm import tqdm
 
@@ -52,6 +52,7 @@ SPREAD = 0.03  # of CMA-ES's first guesses, in units of sqrt(STEP), in which the
 CONVERGED = 1.10  # times the least objective that any search found
 ARRIVES = 0.01  # from the target, at the end [m]
 GRADIENT_ERROR = 1e-5  # against central differences, relative
+LAST, BALANCE = 10, 1e-3  # steps at the end over which forces are added up; what they may be off, relative
 
 
 # ---- the problem -----------------------------------------------------------------------------------------------------
@@ -245,6 +246,13 @@ def check(table: Table, trials: Sequence[Trial], iterations: int) -> bool:
     results.append((text, min(ratio) > 1.0))
     fell = [t.descent.objectives[0] / t.descent.objectives[-1] for t in trials]
     results.append((f"the objective fell {min(fell):.0f} to {max(fell):.0f} times", min(fell) > 10.0))
+
+    no_force = torch.zeros(STEPS, 2, dtype=torch.float64)
+    states = [table.start, *table.run(no_force).detach()]
+    drives = dict.fromkeys(range(STEPS - LAST, STEPS), ds.Control())
+    off = weight_errors(table.sim, states, drives, {0: MASS}, GRAVITY)[0]
+    text = f"without force, in the last {LAST} steps the sheet carries the marble's weight, to {off:.1e}"
+    results.append((text, off <= BALANCE))
 
     ends, found = [], []
     judge = Judge(table.scene, table.sim)

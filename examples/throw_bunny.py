@@ -49,6 +49,8 @@ WORSE = 4.0  # a loss this many times the best is a step gone wrong
 FALL = 100.0  # the squared distance must fall by this
 GRADIENT_ERROR = 1e-5  # median over random directions, relative
 CONTACTS = 2  # objects the bunny must have touched before it arrives
+FREE, GRAVITY = 7, 9.81  # steps before it touches anything; what it shall fall with in them [m/s²]
+FLIGHT_ERROR = 1e-9  # [m]
 
 
 # ---- scene -----------------------------------------------------------------------------------------------------------
@@ -275,6 +277,17 @@ def gradient_report(throw: Throw, shot: Shot) -> ds.diagnostics.GradcheckReport:
     )
 
 
+def flight_error(throw: Throw, shot: Shot) -> float:
+    """How far the bunny is off its course before it touches anything, at most [m].
+
+    Implicit Euler has it at start + v t - g t (t + dt) / 2.
+    """
+    time = DT * torch.arange(1, FREE + 1, dtype=torch.float64)[:, None]
+    down = torch.tensor([0.0, 0.0, -GRAVITY], dtype=torch.float64)
+    exact = throw.rest.position[throw.bunny] + shot.velocity * time + 0.5 * down * time * (time + DT)
+    return float((shot.trajectory.position[:FREE, throw.bunny] - exact).norm(dim=-1).max())
+
+
 def check(throw: Throw, search: Search) -> bool:
     """Print what must hold and whether it does."""
     first, best = search.first, search.best
@@ -282,6 +295,8 @@ def check(throw: Throw, search: Search) -> bool:
     results: list[tuple[str, bool]] = []
     fall = first.loss / best.loss
     results.append((f"squared distance fell {fall:.3g} times (at least {FALL:g})", fall >= FALL))
+    off = flight_error(throw, first)
+    results.append((f"the bunny flies freely for {FREE * DT:g} s, to {off:.1e} m", off <= FLIGHT_ERROR))
     for name, shot in (("first", first), ("best", best)):
         measured = gradient_report(throw, shot)
         text = (

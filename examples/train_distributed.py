@@ -41,6 +41,7 @@ RATE, ITERATIONS, QUICK_ITERATIONS = 0.01, 300, 200
 FALL = 100.0  # the mean squared distance must fall by this
 HIT = 0.95  # part of the test scenes in which the ball must have been struck
 GRADIENT_ERROR = 1e-5  # against central differences, relative
+MOMENTUM_ERROR = 1e-9  # of what the striker brings
 SAME_GRADIENT = 1e-10  # between one process with all scenes and several with a part each, relative
 
 
@@ -206,12 +207,22 @@ def evaluate(policy: Policy) -> tuple[float, float]:
     return float(squared_distance(reached, target)), float((reached.norm(dim=-1) > 0.5 * NEAREST).double().mean())
 
 
+def momentum_error(policy: Policy) -> float:
+    """Of balls of one mass: by how much the sum of their velocities changes when one strikes the other, relative."""
+    launch = torch.tensor([[1.5, 0.1, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)  # a little aside
+    with torch.no_grad():
+        ends = policy.sim.rollout(policy.start.replace(velocity=launch), None, STEPS).velocity[-1]
+    assert float(ends[1].norm()) > 0.1  # it was struck
+    return float((ends.sum(0) - launch[0]).norm() / launch[0].norm())
+
+
 def check(training: Training) -> bool:
     """True if all holds; every process has to call it."""
     share, policy = training.share, training.policy
     expected = reference_gradient(training.seed)
     error = float((training.first_gradient - expected).norm() / expected.norm())
     differences = gradient_error(training.seed)
+    changed = momentum_error(policy)
     weights = torch.cat([p.detach().flatten() for p in policy.network.parameters()])
     spread = float((share.mean(weights) - weights).abs().max())
     (before, _), (after, struck) = evaluate(Policy(training.seed)), evaluate(policy)
@@ -220,6 +231,7 @@ def check(training: Training) -> bool:
     holds = [
         (f"gradient of {share.count} process(es) equals that of one to {error:.1e}", error <= SAME_GRADIENT),
         (f"and central differences to {differences:.1e}", differences <= GRADIENT_ERROR),
+        (f"a strike keeps the momentum, to {changed:.1e}", changed <= MOMENTUM_ERROR),
         (f"processes have the same weights (spread {spread:.1e})", spread == 0.0),
         (f"every step converged ({info.failed_steps} did not)", info.converged),
         (f"{100.0 * struck:.0f} % of {TESTS} new balls were struck", struck >= HIT),

@@ -49,7 +49,7 @@ def test_two_processes_train_by_the_gradient_of_one(example: ModuleType, tmp_pat
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "ok    gradient of 2 process(es) equals that of one" in done.stdout
-    assert done.stdout.count("ok  ") == 6, done.stdout
+    assert done.stdout.count("ok  ") == 7, done.stdout
     two, one = torch.load(path), example.reference_gradient(0)
     assert float(one.norm()) > 1e-3
     assert float((two - one).norm()) <= SAME * float(one.norm())
@@ -63,6 +63,14 @@ def test_one_process_gives_its_gradient_to_who_asks(example: ModuleType, tmp_pat
     path = tmp_path / "gradient.pt"
     example.main(["--iterations", "1", "--no-picture", "--gradient", str(path)])
     assert torch.equal(torch.load(path), example.reference_gradient(0))
+
+
+def test_a_striker_of_another_mass_is_noticed(example: ModuleType) -> None:
+    policy = example.Policy()
+    assert example.momentum_error(policy) <= example.MOMENTUM_ERROR
+    with torch.no_grad():
+        policy.sim.mass[0] *= 1.5
+    assert example.momentum_error(policy) > 0.1
 
 
 def test_scenes_must_divide_between_processes(example: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

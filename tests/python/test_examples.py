@@ -57,13 +57,21 @@ def test_throw_bunny_arrives(bunny: ModuleType, tmp_path: Path, capsys: pytest.C
     assert bunny.main(["--iterations", "40", "--out", str(tmp_path)]) == 0
     output = capsys.readouterr().out
     assert "FAIL" not in output
-    assert output.count("ok  ") == 9
+    assert output.count("ok  ") == 10
     assert (tmp_path / "throw_bunny.png").stat().st_size > 10_000
 
 
 def test_throw_bunny_check_fails_without_optimisation(bunny: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     assert bunny.main(["--iterations", "1", "--no-picture"]) == 1
     assert "FAIL  squared distance fell 1 times" in capsys.readouterr().out
+
+
+def test_throw_bunny_sees_where_gravity_is_less(bunny: ModuleType) -> None:
+    throw = bunny.Throw(bunny.load_mesh())
+    assert bunny.flight_error(throw, bunny.optimise(throw, 1, quiet=True).first) <= bunny.FLIGHT_ERROR
+    with torch.no_grad():
+        throw.sim.gravity *= 0.9
+    assert bunny.flight_error(throw, bunny.optimise(throw, 1, quiet=True).first) > 1e-3
 
 
 def test_throw_bunny_takes_another_mesh(bunny: ModuleType, tmp_path: Path) -> None:
@@ -124,7 +132,7 @@ def test_throw_bunny_says_in_a_line_that_there_is_no_such_mesh(
         ("dominoes", ["--quick"], 8),
         ("trampoline", ["--quick"], 9),
         ("hanging_cloth", ["--quick"], 10),
-        ("marble_inverse", ["--quick"], 7),
+        ("marble_inverse", ["--quick"], 8),
     ],
 )
 def test_cloth_example_passes(
@@ -160,6 +168,7 @@ def test_cloth_example_fails_where_it_should(
     ("name", "arguments", "fails"),
     [
         ("dominoes", ["--duration", "0.3"], "presses on the ground with its weight"),
+        ("learn_sticks", ["--episodes", "1"], "what carries it bears its weight"),
     ],
 )
 def test_example_fails_where_gravity_is_less(
@@ -179,7 +188,7 @@ def test_example_fails_where_gravity_is_less(
 
 
 @pytest.mark.parametrize(
-    ("name", "holds"), [("estimate_mass", 7), ("mujoco_interop", 6), ("learn_sticks", 5), ("learn_cloth", 6)]
+    ("name", "holds"), [("estimate_mass", 7), ("mujoco_interop", 6), ("learn_sticks", 6), ("learn_cloth", 7)]
 )
 def test_application_passes(name: str, holds: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("mujoco" if name == "mujoco_interop" else "gymnasium", reason="pip install .[examples]")
@@ -262,8 +271,39 @@ def test_marble_inverse_fails_where_gradients_are_wrong(
         return objective(self, 0.5 * (unknowns + unknowns.detach()))
 
     monkeypatch.setattr(module.Problem, "objective", half)
-    assert module.main(["--quick", "--seeds", "1", "--no-picture"]) == 1
+    assert module.main(["--quick", "--seeds", "1", "--iterations", "1", "--no-picture"]) == 1
     assert "FAIL  gradients at no force" in capsys.readouterr().out
+
+
+def test_marble_inverse_fails_where_the_marble_is_heavier(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = load("marble_inverse")
+    table = module.Table()
+    with torch.no_grad():
+        table.sim.mass *= 1.5
+    assert not module.check(table, module.run_trials(table, [0], 1, 1), 1)
+    assert "FAIL  without force, in the last 10 steps" in capsys.readouterr().out
+
+
+def test_learning_chooses_its_rate_on_seeds_and_targets_that_are_not_tested(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("gymnasium", reason="pip install .[examples]")
+    sticks, learning = load("learn_sticks"), sys.modules["_learning"]
+    assert not set(learning.CHOOSING) & set(range(sticks.PROGRAM.seeds))
+    drawn = []
+
+    def starts(task: object, first: int = learning.TESTED) -> object:
+        drawn.append(first)
+        return task.start(*(np.random.default_rng(first + i) for i in range(2)))  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(learning, "held_out_starts", starts)
+    monkeypatch.setattr(learning, "CHOOSING", range(10, 11))
+    monkeypatch.setattr(learning, "RATES", (1e-5, 1e-2))
+    assert sticks.main(["--choose-rate", "--episodes", "2"]) == 0
+    assert set(drawn) == {learning.CHOSEN}
+    assert "the least is left by rate 0.01" in capsys.readouterr().out
 
 
 def test_mujoco_interop_fails_where_the_layer_has_another_mass(
