@@ -11,6 +11,7 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxMoves = 100;
+constexpr int kMaxListings = 8;          // for a move that leads to what it was found without
 constexpr double kClearance = 1e-3;      // of the contact's depth: what to aim at beyond the rest distance
 constexpr double kAccepted = 1e-9;       // of the contact's depth: how far below the rest distance is good enough
 constexpr double kWellDefined = 0.02;    // of the contact's depth: nearer than this a normal may be rounding noise
@@ -108,10 +109,17 @@ public:
 
     Separation run() {
         for (int round = 0; round < kMaxMoves; ++round) {
-            list_rows(round >= kRoundsBeforeGuesses);
+            const bool guess = round >= kRoundsBeforeGuesses;
+            list_rows(m_zero, guess);
             if (m_result.complete) break;
-            set_metric();
-            move();
+            Coordinates move = find_move();
+            std::size_t known = 0;
+            for (int listings = 0; listings < kMaxListings && m_model.rows.size() != known; ++listings) {
+                known = m_model.rows.size();
+                list_rows(move, guess);
+                if (m_model.rows.size() != known) move = find_move();
+            }
+            apply(move);
         }
         for (std::size_t i = 0; i < m_count; ++i) m_result.poses.push_back(m_zone.bodies[i].start);
         for (const ZoneNode& node : m_zone.nodes) m_result.nodes.push_back(node.start);
@@ -119,9 +127,10 @@ public:
     }
 
 private:
-    void list_rows(bool guess) {
+    /// One for each contact that a move may bring too near.
+    void list_rows(Coordinates end, bool guess) {
         m_zone.bodies.resize(m_count);
-        Coordinates begin = m_zero, end = m_zero;
+        Coordinates begin = m_zero;
         collect_contacts(m_zone, m_passive, begin, end, m_coverage);
         Placement at;
         at.y = begin;
@@ -135,14 +144,16 @@ private:
             const ContactRange& range = contact.law.range;
             ContactGeometry geometry = contact_geometry(m_zone, contact, at.poses, at.nodes);
             const double depth = range.rest - range.floor;
-            if (!(geometry.distance < range.rest - kAccepted * depth) || geometry.sine_sq == 0.0) continue;
-            m_result.complete = false;
+            if (geometry.sine_sq == 0.0) continue;
             const double lack = (range.rest - geometry.distance) / depth;
-            if (lack > m_result.lack) {
-                m_result.worst = contact.contact;
-                m_result.distance = geometry.distance;
-                m_result.rest = range.rest;
-                m_result.lack = lack;
+            if (lack > kAccepted) {
+                m_result.complete = false;
+                if (lack > m_result.lack) {
+                    m_result.worst = contact.contact;
+                    m_result.distance = geometry.distance;
+                    m_result.rest = range.rest;
+                    m_result.lack = lack;
+                }
             }
             const SignedGap gap = signed_gap(m_zone, contact, geometry, guess);
             if (!gap.valid) continue;
@@ -172,9 +183,14 @@ private:
         m_model.gradient = m_zero;
     }
 
-    void move() {
+    Coordinates find_move() {
+        set_metric();
         Coordinates p = m_zero;
         minimise(m_model, 1.0, 0.0, m_system, m_workspace, p);
+        return p;
+    }
+
+    void apply(const Coordinates& p) {
         for (std::size_t i = 0; i < m_count; ++i) {
             ZoneBody& body = m_zone.bodies[i];
             body.start = pose_at(body, p.bodies[i]);

@@ -274,6 +274,22 @@ def test_where_there_is_no_room_for_the_thickness_everything_says_so() -> None:
         sim(ds.State(position))
 
 
+@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("gap", [0.0, 1e-3, 1.5e-3])
+def test_what_is_lifted_off_the_ground_lifts_what_lies_on_it(count: int, gap: float) -> None:
+    """Boxes whose gaps are the thickness, or a little more, are near enough when the lowest has to move, not when it has."""
+    scene = ds.Scene()
+    scene.add_ground()
+    for k in range(count):
+        scene.add_body(ds.shapes.box(1.0), density=1e3, position=(-0.25 * k, 0.0, 0.5 + (1.0 + gap) * k))
+    sim = ds.Simulator(scene, dt=0.01, thickness=1e-3)
+    start = sim.initial_state()
+    assert sim.min_distance(start) == pytest.approx(0.0, abs=1e-5)
+    lifts = start.position[:, 2] - torch.tensor([0.5 + (1.0 + gap) * k for k in range(count)]).double()
+    assert bool((lifts >= 0.0).all())
+    assert lifts.max() < 1.1e-3 * count
+
+
 def test_a_little_room_is_enough() -> None:
     scene = ds.Scene()
     for x in (-1.001, 1.001):
