@@ -26,13 +26,14 @@ public:
             if (m_search.m_options.interrupt != nullptr) m_search.m_options.interrupt->throw_if_asked();
             const bool driven = m_search.drives_done();
             const Accuracy now = look();
+            if (driven) keep_best(now);
             if (m_search.m_result.iterations >= m_search.m_options.max_iterations)
-                return m_search.fail(StepStatus::too_many_iterations);
+                return fail(StepStatus::too_many_iterations);
             if (m_search.m_result.iterations == 0 && driven && rests(now)) return;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
             m_factors += way.newton_steps;
-            if (m_factors > kMaxFactors) return m_search.fail(StepStatus::crawls);
-            if (!way.found) return m_search.fail(StepStatus::no_descent);
+            if (m_factors > kMaxFactors) return fail(StepStatus::crawls);
+            if (!way.found) return fail(StepStatus::no_descent);
             const double motion = motion_to_end();
             const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
             if (!driven) {
@@ -69,6 +70,27 @@ private:
         m_model.aim_for(
             {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning, now.residual < m_wanted});
         return now;
+    }
+
+    void keep_best(const Accuracy& now) {
+        const double left = now.residual * now.reference;
+        if (left >= m_least) return;
+        m_least = left;
+        m_least_residual = now.residual;
+        m_best = m_work.point.y;
+    }
+
+    /// Where least was left of the balance: models that find none may have squeezed things from which no later step recovers.
+    void fail(StepStatus status) {
+        m_search.fail(status);
+        if (m_least == kInfinity) return;
+        m_search.m_result.residual = m_least_residual;
+        for (int i = static_cast<int>(m_best.bodies.size()); i < zone().body_count(); ++i)  // joined since
+            m_best.bodies.push_back(zone().bodies[i].target);
+        m_search.m_path.ensure_covered(m_best);
+        m_work.trial.y = m_best;
+        evaluate(zone(), m_work.trial, &m_work.point);
+        m_search.accept_trial();
     }
 
     /// Whether the point is the solution, with contacts that do not slip and that nothing pulls at.
@@ -116,6 +138,8 @@ private:
     ModelDirection& m_model;
     ZoneWorkspace& m_work;
     Coordinates m_balance;  // what is left of it
+    Coordinates m_best;     // where least was left of it
+    double m_least = kInfinity, m_least_residual = 0.0;
     double m_wanted = 0.0;  // the residual asked for
     double m_least_motion = kInfinity;
     int m_factors = 0, m_stalls = 0, m_damped = 0, m_still = 0;
