@@ -277,7 +277,7 @@ def test_where_there_is_no_room_for_the_thickness_everything_says_so() -> None:
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("gap", [0.0, 1e-3, 1.5e-3])
 def test_what_is_lifted_off_the_ground_lifts_what_lies_on_it(count: int, gap: float) -> None:
-    """Boxes whose gaps are the thickness, or a little more, are near enough when the lowest has to move, not when it has."""
+    """Boxes whose gaps are the thickness, or a little more, are far enough apart until the lowest has moved."""
     scene = ds.Scene()
     scene.add_ground()
     for k in range(count):
