@@ -11,7 +11,7 @@ namespace diffsim {
 namespace {
 
 constexpr int kMaxMoves = 100;
-constexpr int kMaxListings = 8;          // for a move that leads to what it was found without
+constexpr int kMaxMoveListings = 8;      // for a move that leads to what it was found without
 constexpr double kClearance = 1e-3;      // of the contact's depth: what to aim at beyond the rest distance
 constexpr double kAccepted = 1e-9;       // of the contact's depth: how far below the rest distance is good enough
 constexpr double kWellDefined = 0.02;    // of the contact's depth: nearer than this a normal may be rounding noise
@@ -114,7 +114,7 @@ public:
             if (m_result.complete) break;
             Coordinates move = find_move();
             std::size_t known = 0;
-            for (int listings = 0; listings < kMaxListings && m_model.rows.size() != known; ++listings) {
+            for (int listings = 0; listings < kMaxMoveListings && m_model.rows.size() != known; ++listings) {
                 known = m_model.rows.size();
                 list_rows(move, guess);
                 if (m_model.rows.size() != known) move = find_move();
