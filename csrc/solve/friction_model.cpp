@@ -320,7 +320,8 @@ private:
         m_second = dot(m_w.step, m_w.smooth_step);
     }
 
-    /// What is left of the balance along the step, with bounds that stay as they are: without turns the slope of a convex energy.
+    /// What is left of the balance along the step, with bounds that stay as they are: without turns the slope of a convex
+    /// energy.
     double slope(double t, const std::vector<double>& bound) const {
         double sum = m_first + t * m_second;
         for (std::size_t r = 0; r < m_rows.size(); ++r) {

@@ -113,11 +113,11 @@ public:
             list_rows(m_zero, guess);
             if (m_result.complete) break;
             Coordinates move = find_move();
-            std::size_t known = 0;
-            for (int listings = 0; listings < kMaxMoveListings && m_model.rows.size() != known; ++listings) {
-                known = m_model.rows.size();
+            for (int listings = 0; listings < kMaxMoveListings; ++listings) {
+                const std::size_t known = m_model.rows.size();
                 list_rows(move, guess);
-                if (m_model.rows.size() != known) move = find_move();
+                if (m_model.rows.size() == known) break;
+                move = find_move();
             }
             apply(move);
         }
