@@ -4,15 +4,19 @@
 #include <cmath>
 
 #include "zone/gmres.hpp"
+#include "zone/inertia.hpp"
 #include "zone/zone_accuracy.hpp"
 
 namespace diffsim {
 namespace {
 
-constexpr int kMaxBalanceSteps = 100;
-constexpr int kCrawlAfter = 10;       // Newton steps before turns are left out, then bounds are kept from following
-constexpr double kBoundChange = 0.1;  // of the largest: bounds that change less may follow again
-constexpr int kMaxFrozenRounds = 10;  // of bounds that stand still
+constexpr int kCrawlAfter = 10;        // Newton steps before turns are left out, then before all goes in small steps
+constexpr int kMaxBalanceSteps = 300;  // of all kinds
+constexpr double kBoundChange = 0.1;   // of the largest: bounds that change less may follow again
+constexpr int kMaxFrozenRounds = 10;   // of bounds that stand still
+constexpr int kFlowSteps = 4;          // Newton steps of one in pseudo-time
+constexpr double kFlowAccuracy = 0.1;  // of what is left at its begin: to which its end is found
+
 constexpr int kMaxBisections = 30;    // bisections of a line search
 constexpr double kFlat = 0.1;         // of the slope at the start: that at the end of a step taken in full
 constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
@@ -44,46 +48,111 @@ public:
         const Coordinates start = m_p;
         const std::vector<FrictionRow> states = m_friction;
         if (!m_model.turns.empty()) {
-            if (solve(true)) return m_result;
+            if (solve()) return m_result;
             m_model.turns.clear();
             m_p = start;
             m_friction = states;
         }
-        solve(false);
+        solve();
         return m_result;
     }
 
 private:
-    /// From where p and the states are. False where it crawls, `may_give_up`, and is given up.
-    bool solve(bool may_give_up) {
+    /// From where p and the states are. False where it crawls with turns, and is given up.
+    bool solve() {
         look();
         if (!keep_states()) return true;
-        int rounds = 0;
-        for (int steps = 0;; ++steps) {
-            look();
-            follow();
-            add_all(nullptr);
-            const double left = largest_scaled(m_zone, m_w.gradient);
-            if (left <= m_goal.tolerance && m_frozen) {
-                m_frozen = let_bounds_follow() > kBoundChange && ++rounds < kMaxFrozenRounds;
-                steps = -1;
-                continue;
-            }
-            m_result.status =
-                left <= m_goal.tolerance ? ModelSolution::Status::solved : ModelSolution::Status::crawling;
-            if (left <= m_goal.tolerance || m_result.newton_steps >= kMaxBalanceSteps) break;
-            if (!m_frozen && steps >= kCrawlAfter) {
-                if (may_give_up) return false;
-                m_frozen = true;
-                rounds = 0;
-            }
-            if (!newton_step()) {
-                m_result.status = ModelSolution::Status::indefinite;
-                return true;
-            }
-        }
-        keep();
+        Pace pace = newton();
+        if (pace == Pace::crawls && !m_model.turns.empty()) return false;
+        if (pace == Pace::crawls) pace = follow_in_rounds();
+        if (pace == Pace::crawls) pace = newton();
+        if (pace == Pace::crawls) flow();
         return true;
+    }
+
+    enum class Pace { ended, crawls };
+
+    /// Ends where the balance is found, or where the matrix is indefinite.
+    Pace newton() {
+        for (int steps = 0; find_left() > m_goal.tolerance; ++steps) {
+            if (steps == kCrawlAfter) return Pace::crawls;
+            if (!newton_step()) return Pace::ended;
+        }
+        finish(ModelSolution::Status::solved);
+        return Pace::ended;
+    }
+
+    /// With bounds that stand still, which is a convex minimisation, then follow, and stand still again.
+    Pace follow_in_rounds() {
+        find_left();
+        m_frozen = true;
+        double change = 1.0;
+        for (int rounds = 0; rounds < kMaxFrozenRounds && change > kBoundChange; ++rounds) {
+            while (find_left() > m_goal.tolerance) {
+                if (m_result.newton_steps >= kMaxBalanceSteps) break;
+                if (!newton_step()) return Pace::ended;
+            }
+            change = let_bounds_follow();
+        }
+        m_frozen = false;
+        return Pace::crawls;
+    }
+
+    /// Of bounds that stood still: how far they are from the forces now, of the largest.
+    double let_bounds_follow() {
+        double change = 0.0, largest = 0.0;
+        for (std::size_t f = 0; f < m_friction.size(); ++f) {
+            const double now = m_friction[f].coefficient * force(m_friction[f].normal);
+            change = std::max(change, std::abs(now - m_w.bound[f]));
+            largest = std::max(largest, now);
+            m_w.bound[f] = now;
+        }
+        return largest > 0.0 ? change / largest : 0.0;
+    }
+
+    /// Along M dp/dτ = -F(p), F what is left of the balance, by implicit Euler steps in a pseudo-time that double where Newton's
+    /// method finds their ends. Where bounds that follow the forces feed themselves, Newton's own steps go to and fro between
+    /// contacts that stick and slip, and rounds of bounds that stand still lead away, while this goes on until something holds.
+    void flow() {
+        double duration = 1.0;  // in which inertia alone takes half of F away
+        for (double left = find_left(); left > m_goal.tolerance; left = find_left()) {
+            if (m_result.newton_steps >= kMaxBalanceSteps) return finish(ModelSolution::Status::crawling);
+            const Coordinates begin = m_p;
+            bool found = false;
+            for (int k = 0; k < kFlowSteps && !found; ++k) {
+                if (!factorize(1.0 / duration)) return;
+                ++m_result.newton_steps;
+                hold_to(begin, 1.0 / duration);
+                solve_step(bounds_matter());
+                add(1.0, m_w.step, m_p);
+                find_left();
+                hold_to(begin, 1.0 / duration);
+                found = largest_scaled(m_zone, m_w.gradient) <= kFlowAccuracy * left;
+            }
+            if (!found) m_p = begin;
+            duration *= found ? 2.0 : 0.25;
+        }
+        finish(ModelSolution::Status::solved);
+    }
+
+    /// The balance, with so much more inertia from there on.
+    void hold_to(const Coordinates& begin, double weight) {
+        m_w.held = m_p;
+        add(-1.0, begin, m_w.held);
+        add_mass_product(m_zone, weight, m_w.held, m_w.gradient);
+    }
+
+    void finish(ModelSolution::Status status) {
+        m_result.status = status;
+        for (std::size_t r = 0; r < m_rows.size(); ++r) m_rows[r].force = force(r);
+    }
+
+    /// What is left of the balance at p, in units of |L⁻¹ g|.
+    double find_left() {
+        look();
+        follow();
+        add_all(nullptr);
+        return largest_scaled(m_zone, m_w.gradient);
     }
 
     double force(std::size_t r) const { return m_rows[r].stiffness * std::max(0.0, m_w.violation[r]); }
@@ -143,22 +212,11 @@ private:
         }
     }
 
-    /// Of bounds that stood still: how far they are from the forces now, of the largest.
-    double let_bounds_follow() {
-        double change = 0.0, largest = 0.0;
-        for (std::size_t f = 0; f < m_friction.size(); ++f) {
-            const double now = m_friction[f].coefficient * force(m_friction[f].normal);
-            change = std::max(change, std::abs(now - m_w.bound[f]));
-            largest = std::max(largest, now);
-            m_w.bound[f] = now;
-        }
-        return largest > 0.0 ? change / largest : 0.0;
-    }
-
-    /// The balance with these forces, and the symmetric matrix for bounds that stay.
-    bool factorize() {
+    /// The balance with these forces, and the symmetric matrix for bounds that stay. `weight`: of so much more inertia.
+    bool factorize(double weight = 0.0) {
         m_system.copy_values(m_model.smooth);
         add_all(&m_system);
+        if (weight > 0.0) add_mass_matrix(m_zone, weight, m_system);
         return m_system.factorize();
     }
 
@@ -348,10 +406,6 @@ private:
         return 0.5 * (lower + upper);
     }
 
-    void keep() {
-        for (std::size_t r = 0; r < m_rows.size(); ++r) m_rows[r].force = force(r);
-    }
-
     ContactModel& m_model;
     std::vector<ContactRow>& m_rows;
     std::vector<FrictionRow>& m_friction;
@@ -361,7 +415,7 @@ private:
     BalanceWorkspace& m_w;
     Coordinates& m_p;
     double m_first = 0.0, m_second = 0.0;  // slope of the smooth part along the step, and its rate
-    bool m_frozen = false;                 // bounds stay as they are: the model is a convex minimisation for a while
+    bool m_frozen = false;                 // bounds stay as they are
     ModelSolution m_result;
 };
 

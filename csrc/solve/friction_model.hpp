@@ -10,7 +10,8 @@
 /// The bound follows the force inside the model, so that this is no minimum: the solution of
 ///     H p + g - Σ force row + Σ rows_s μ force u = 0
 /// is found by Newton's method, whose matrix S - N is not symmetric: S is what it is for bounds that stay as they are, N what
-/// they change by. GMRES with the factor of S solves with it, and with what S leaves out of contacts that turn.
+/// they change by. GMRES with the factor of S solves with it, and with what S leaves out of contacts that turn. Where that does not
+/// end it, p follows M dp/dτ = -F(p), F the left side (pseudo-transient continuation, Kelley and Keyes 1998).
 namespace diffsim {
 
 /// What a model with friction is asked for.
@@ -25,7 +26,7 @@ struct BalanceGoal {
 
 /// Memory of balance(), kept from model to model.
 struct BalanceWorkspace {
-    Coordinates smooth_p, gradient, step, smooth_step;
+    Coordinates smooth_p, gradient, step, smooth_step, held;
     std::vector<double> violation, slope, bound;
     std::vector<char> pushes;
     std::vector<Vec2> slip, slip_step, pull;
