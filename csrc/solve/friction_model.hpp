@@ -22,6 +22,7 @@ struct BalanceGoal {
     bool is_settled = false;
     bool turns = false;        ///< what rows do not see of contacts is in the model, too; see FrictionTurns
     bool is_balanced = false;  ///< only slips of sticking contacts are left to end
+    bool may_crawl = true;     ///< a model that is not solved to its end is of use
 };
 
 /// Memory of balance(), kept from model to model.

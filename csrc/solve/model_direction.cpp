@@ -56,6 +56,12 @@ void ModelDirection::start_from(const ZonePoint& point) {
     m_list = -1;
 }
 
+void ModelDirection::recall(Memory memory) {
+    m_kept = std::move(memory);
+    m_list = -1;
+    forget_damping();
+}
+
 void ModelDirection::keep_forces() {
     m_kept.clear();
     std::fill(m_forces.begin(), m_forces.end(), 0.0);
@@ -204,7 +210,8 @@ bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
         const ModelSolution balanced = balance(m_model, m_zone, m_goal, m_system, m_balance, p);
         newton_steps += balanced.newton_steps;
         m_right_guess = balanced.newton_steps == 1;
-        return balanced.status != ModelSolution::Status::indefinite;
+        return balanced.status == ModelSolution::Status::solved ||
+               (m_goal.may_crawl && balanced.status == ModelSolution::Status::crawling);
     }
     const Coordinates start = p;
     ModelSolution solution = minimise(m_model, 1.0, kCrawling, m_system, m_work, p);

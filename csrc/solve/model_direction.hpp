@@ -20,6 +20,17 @@ public:
     /// Begin with the forces at a point: those of the last step, where that is the start of this one.
     void start_from(const ZonePoint& point);
 
+    /// What the last model found of a contact.
+    struct Kept {
+        Contact contact;
+        double force;
+        FrictionState friction;
+    };
+    using Memory = std::vector<Kept>;
+    /// The contacts' forces and states, and a return to them without damping.
+    const Memory& memory() const { return m_kept; }
+    void recall(Memory memory);
+
     struct Way {
         bool found = false;    ///< false where rounding spoils the model's matrix
         double free = 0.0;     ///< how much of the way to y_end is free for all that is listed
@@ -64,12 +75,6 @@ private:
         ContactGeometry geometry;
         double stiffness;  ///< of the row
         double wanted;     ///< from which distance on it pushes [m]
-    };
-    /// What the last model found of a contact.
-    struct Kept {
-        Contact contact;
-        double force;
-        FrictionState friction;
     };
 
     void recall_forces();
@@ -118,7 +123,7 @@ private:
     std::vector<PushingContact> m_pushing;
     std::vector<double> m_forces;           // of the last model, per contact of the zone
     std::vector<FrictionState> m_friction;  // the same; empty where there is none
-    std::vector<Kept> m_kept;               // the same, by contact, across lists
+    Memory m_kept;                          // the same, by contact, across lists
     BalanceGoal m_goal;
     BalanceWorkspace m_balance;
     Coordinates m_way;             // the last way, from the point

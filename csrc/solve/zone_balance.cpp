@@ -13,8 +13,12 @@ constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
 constexpr int kMaxDamped = 4;       // models in a row: what friction takes up is known of the last model's bounds alone
 constexpr double kRest = 1e-12;     // of the forces: a model that moves nothing further has found the balance
-constexpr int kMaxFactors = 10000;  // of all models of a step: those that converge have taken up to 7,600
-constexpr int kStandsStill = 3;     // models in balance without halving their motion
+constexpr int kMaxFactors = 10000;  // of all models of a step
+constexpr int kMaxAtOnce = 2500;    // of them before the balance is searched in parts
+constexpr int kMaxOfPart = 8;       // models
+constexpr double kFirstPart = 0.25, kLeastPart = 1e-3;
+constexpr double kEnough = 1e-3;  // residual from which the next part goes on
+constexpr int kStandsStill = 3;   // models in balance without halving their motion
 
 class BalanceSearch {
 public:
@@ -22,31 +26,54 @@ public:
         : m_search(search), m_model(model), m_work(search.m_work) {}
 
     void run() {
-        for (m_search.m_result.iterations = 0;; ++m_search.m_result.iterations) {
+        m_search.m_result.iterations = 0;
+        StepStatus status = search(m_search.m_options.max_iterations);
+        if (status == StepStatus::blocked) return m_search.fail(status);
+        if (status != StepStatus::converged && m_least < kInfinity && !is_driven()) status = search_in_parts(status);
+        if (status != StepStatus::converged) fail(status);
+    }
+
+private:
+    const Zone& zone() const { return m_search.m_zone; }
+
+    /// What a search begins with: where all is, what is left of the balance there, and the forces of contacts.
+    struct Start {
+        Coordinates y, balance;
+        ModelDirection::Memory contacts;
+    };
+
+    bool is_held() const { return !m_held.bodies.empty() || !m_held.nodes.empty(); }
+
+    /// From where the point is.
+    StepStatus search(int max_iterations) {
+        m_damped = m_still = 0;
+        m_least_motion = kInfinity;
+        for (int iterations = 0;; ++iterations, ++m_search.m_result.iterations) {
             if (m_search.m_options.interrupt != nullptr) m_search.m_options.interrupt->throw_if_asked();
             const bool driven = m_search.drives_done();
             const Accuracy now = look();
-            if (driven) keep_best(now);
-            if (m_search.m_result.iterations >= m_search.m_options.max_iterations)
-                return fail(StepStatus::too_many_iterations);
-            if (m_search.m_result.iterations == 0 && driven && rests(now)) return;
+            if (driven && !is_held()) keep_best(now);
+            if (m_is_rough && now.residual < kEnough) return StepStatus::converged;
+            if (iterations >= max_iterations) return StepStatus::too_many_iterations;
+            if (iterations == 0 && driven && !m_in_parts && rests(now)) return StepStatus::converged;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
             m_factors += way.newton_steps;
-            if (m_factors > kMaxFactors) return fail(StepStatus::crawls);
-            if (!way.found) return fail(StepStatus::no_descent);
+            if (m_factors > (m_in_parts ? kMaxFactors : kMaxAtOnce)) return StepStatus::crawls;
+            if (!way.found) return StepStatus::no_descent;
             const double motion = motion_to_end();
             const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
             if (!driven) {
-                if (!follow_drives(way, step)) return m_search.fail(StepStatus::blocked);
+                if (!follow_drives(way, step)) return StepStatus::blocked;
                 continue;
             }
             m_search.m_path.set_trial(m_work.y_end, step);
             if (step == 1.0) m_work.trial.y = m_work.y_end;
             evaluate(zone(), m_work.trial, &m_work.point);
-            const bool is_first = m_search.m_result.iterations == 0;
-            if (!is_first && step == 1.0 && now.residual < kGoodEnough * m_wanted &&
-                (motion <= kRest * now.reference || stands_still(motion)))
-                return m_search.accept_trial();
+            if (iterations > 0 && step == 1.0 && now.residual < kGoodEnough * m_wanted &&
+                (motion <= kRest * now.reference || stands_still(motion))) {
+                m_search.accept_trial();
+                return StepStatus::converged;
+            }
             if (now.residual > kSettled && rises(step)) continue;
             m_damped = 0;
             m_search.accept_trial();
@@ -54,12 +81,62 @@ public:
         }
     }
 
-private:
-    const Zone& zone() const { return m_search.m_zone; }
+    /// Whether bodies that move as told are near: what these squeeze no part of the load frees.
+    bool is_driven() const {
+        const auto moves = [](const ZoneBody& body) { return !body.target.isZero(0.0); };
+        return std::any_of(zone().bodies.begin() + zone().dynamic_count, zone().bodies.end(), moves);
+    }
+
+    /// From the first point where all that is driven is at its target, with what is left of the balance there held back:
+    /// F(y) = (1 - t) F(first), t from 0 to 1 in parts that double and halve. Where contacts turn on the way, so that models of all
+    /// of it lead past each other, each part is reached from the last.
+    StepStatus search_in_parts(StepStatus status) {
+        m_in_parts = true;
+        Start begin = m_first;
+        double carried = 0.0;
+        for (double part = kFirstPart; part > kLeastPart && m_factors <= kMaxFactors;) {
+            go_to(begin.y);
+            m_model.recall(begin.contacts);
+            const double next = std::min(1.0, carried + part);
+            m_held = m_first.balance;
+            scale(1.0 - next, m_held);
+            if (search_part(next == 1.0) != StepStatus::converged) {
+                part *= 0.5;
+                continue;
+            }
+            if (next == 1.0) return StepStatus::converged;
+            carried = next;
+            part *= 2.0;
+            begin = {m_work.point.y, {}, m_model.memory()};
+        }
+        m_held = {};
+        return status;
+    }
+
+    /// Near enough to go on from; the last one to its end.
+    StepStatus search_part(bool is_last) {
+        const int most = m_search.m_options.max_iterations;
+        m_is_rough = true;
+        const StepStatus status = search(std::min(kMaxOfPart, most));
+        m_is_rough = false;
+        if (!is_last || status != StepStatus::converged) return status;
+        m_held = {};
+        return search(most);
+    }
+
+    void go_to(Coordinates y) {
+        for (int i = static_cast<int>(y.bodies.size()); i < zone().body_count(); ++i)  // joined since
+            y.bodies.push_back(zone().bodies[i].target);
+        m_search.m_path.ensure_covered(y);
+        m_work.trial.y = y;
+        evaluate(zone(), m_work.trial, &m_work.point);
+        m_search.accept_trial();
+    }
 
     /// What is left of the balance at the point, and what that asks of the next model.
     Accuracy look() {
         differentiate(zone(), m_work.point, Curvature::none, m_work.derivatives, nullptr);
+        add(-1.0, m_held, m_work.derivatives.gradient);
         m_balance = m_work.derivatives.gradient;
         m_model.add_friction_forces(m_balance);
         Accuracy now = m_search.current_accuracy();
@@ -68,12 +145,14 @@ private:
         m_wanted = std::max(m_search.m_options.tolerance, now.floor);
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
         m_model.aim_for(
-            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning, now.residual < m_wanted});
+            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning, now.residual < m_wanted,
+             !m_in_parts});
         return now;
     }
 
     void keep_best(const Accuracy& now) {
         const double left = now.residual * now.reference;
+        if (m_least == kInfinity) m_first = {m_work.point.y, m_balance, m_model.memory()};
         if (left >= m_least) return;
         m_least = left;
         m_least_residual = now.residual;
@@ -85,12 +164,7 @@ private:
         m_search.fail(status);
         if (m_least == kInfinity) return;
         m_search.m_result.residual = m_least_residual;
-        for (int i = static_cast<int>(m_best.bodies.size()); i < zone().body_count(); ++i)  // joined since
-            m_best.bodies.push_back(zone().bodies[i].target);
-        m_search.m_path.ensure_covered(m_best);
-        m_work.trial.y = m_best;
-        evaluate(zone(), m_work.trial, &m_work.point);
-        m_search.accept_trial();
+        go_to(m_best);
     }
 
     /// Whether the point is the solution, with contacts that do not slip and that nothing pulls at.
@@ -124,7 +198,11 @@ private:
 
     /// Whether energy and what friction takes up rise; then the model is damped.
     bool rises(double step) {
-        const double change = m_work.trial.energy - m_work.point.energy + m_model.friction_work(step);
+        double change = m_work.trial.energy - m_work.point.energy + m_model.friction_work(step);
+        for (std::size_t i = 0; i < m_held.bodies.size(); ++i)
+            change -= m_held.bodies[i].dot(m_work.trial.y.bodies[i] - m_work.point.y.bodies[i]);
+        for (std::size_t i = 0; i < m_held.nodes.size(); ++i)
+            change -= m_held.nodes[i].dot(m_work.trial.y.nodes[i] - m_work.point.y.nodes[i]);
         if (change <= m_search.current_noise()) return false;
         if (++m_damped > kMaxDamped) {
             m_model.forget_damping();
@@ -139,6 +217,9 @@ private:
     ZoneWorkspace& m_work;
     Coordinates m_balance;  // what is left of it
     Coordinates m_best;     // where least was left of it
+    Start m_first;          // where drives were done first
+    Coordinates m_held;     // of the balance: not to be brought about yet
+    bool m_in_parts = false, m_is_rough = false;
     double m_least = kInfinity, m_least_residual = 0.0;
     double m_wanted = 0.0;  // the residual asked for
     double m_least_motion = kInfinity;
