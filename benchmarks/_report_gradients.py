@@ -46,6 +46,7 @@ class GradientScene:
     # By central differences. What is in contact, implicitfast does as Euler.
     mujoco: Sequence[Settings] = (Settings("Euler"), Settings("RK4"))
     quick: bool = False  # part of quick runs
+    note: str = ""  # what its errors are of, where a reader might take them for something else
 
 
 class Inputs:
@@ -57,6 +58,9 @@ class Inputs:
         self.start = self.sim.initial_state()
         self.count = round(case.duration / dt)
         self.values = torch.stack([self._field(name)[index].flatten()[0] for name, index in case.inputs]).detach()
+        # Errors are of changes of parameters by a part of themselves: else what is large in its unit would not count.
+        sizes = [1.0 if hasattr(self.start, name) else float(v) for v, (name, _) in zip(self.values, case.inputs)]
+        self.sizes = np.array(sizes)
 
     def _field(self, name: str) -> Tensor:
         return getattr(self.start if hasattr(self.start, name) else self.sim, name).detach()
@@ -141,8 +145,8 @@ def continuous(case: GradientScene) -> np.ndarray:
     return 2.0 * fine - coarse
 
 
-def relative(found: np.ndarray, right: np.ndarray) -> float:
-    return float(np.linalg.norm(found - right) / np.linalg.norm(right))
+def relative(found: np.ndarray, right: np.ndarray, sizes: np.ndarray) -> float:
+    return float(np.linalg.norm(sizes * (found - right)) / np.linalg.norm(sizes * right))
 
 
 # ---- losses and closed forms -----------------------------------------------------------------------------------------

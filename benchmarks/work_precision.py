@@ -147,13 +147,13 @@ DISCRETE, CONTINUOUS = (
 
 
 def measure_gradients(case: GradientScene, report: Report, steps: tuple[float, ...], quick: bool) -> None:
-    right = continuous(case)
+    right, sizes = continuous(case), Inputs(case, case.steps[0]).sizes
 
     def add(name: str, dt: float, gradient: Any, milliseconds: float, discrete: Any = None) -> None:
         row = {"scene": case.name, "name": name, "dt_s": dt, "time_ms": milliseconds}
         if discrete is not None:
-            report.add({**row, "what": DISCRETE, "error": relative(gradient, discrete)})
-        report.add({**row, "what": CONTINUOUS, "error": relative(gradient, right)})
+            report.add({**row, "what": DISCRETE, "error": relative(gradient, discrete, sizes)})
+        report.add({**row, "what": CONTINUOUS, "error": relative(gradient, right, sizes)})
 
     for dt in steps:
         discrete: dict[str, Any] = {}  # by integrator
@@ -184,6 +184,7 @@ def section_of_gradients(case: GradientScene, report: Report) -> Section | None:
         f" {run_of(rows)}",
         f"As dt falls from {x[0]:g} to {x[-1]:g} s, the exact adjoint's error from it goes from {falls}.",
         verdict(useful),
+        *([case.note] if case.note else []),
     ]
     return Section(f"gradient_{case.name}", case.title, text, panels)
 
