@@ -196,6 +196,10 @@ INTRODUCTION = (
     " forms take into account; errors of exactly 0 are drawn at the bottom.",
     "*Smooth motion*: our default steps are implicit Euler, of first order; `trapezoidal` is of second order there,"
     " keeps what free motion keeps, and pays for contact with a second solve. MuJoCo's RK4 is of fourth order.",
+    "*Why implicit Euler is the default*: where things meet, the errors of `trapezoidal` are the same (push, oblique"
+    " impact), in heaps a step takes up to 4 times as long and makes up to 3e-4 of the energy that is lost where"
+    " implicit Euler makes none (pile), and cloth keeps implicit Euler in either. Where things fly, slide and roll,"
+    " `trapezoidal` is more exact by orders in the same time: use it there.",
     "*Friction*: a stack that leans, a box that has stopped and a ball that rolls should not creep or slip at all."
     " MuJoCo's friction gives way with a speed that impratio divides; ours is exact, and slips by rounding.",
 )
