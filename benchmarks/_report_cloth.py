@@ -78,7 +78,7 @@ def body_error(motion: Motion, limit: Motion | None) -> float:
 
 LINEARISED = (
     "Why: MuJoCo's `discrete` takes one linearised step and lets things sink in; ours solves the nonlinear one, with"
-    " contacts, to the end: two to ten times as long, the more the larger the step."
+    " contacts, to the end: two to twenty times as long, the more the larger the step."
 )
 CLOTH_DTS, CLOTH_LIMIT_DT = (0.02, 0.01, 0.005, 0.0025, 0.00125), 0.0003125
 
