@@ -118,6 +118,12 @@ def _coin_angle(motion: Motion, _: Motion | None) -> float:
 
 # ---- the table -------------------------------------------------------------------------------------------------------
 
+_CALL = (
+    "Why: a call of ours from Python takes 0.2 to 0.4 ms whatever it does, of which runs of few steps consist. Its"
+    " steps take half as long as MuJoCo's."
+)
+_ORDER = _CALL + " RK4 is of fourth order, ours of second at best: of smooth motion alone it makes the smallest errors."
+
 FREE = (
     ValueScene(
         "projectile",
@@ -128,6 +134,7 @@ FREE = (
         TENTHS,
         {"path (rms) [m]": _projectile_error},
         (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
+        note=_CALL,
     ),
     ValueScene(
         "brick",
@@ -138,6 +145,7 @@ FREE = (
         TENTHS,
         {"attitude after 4 s [rad]": _brick_angle, "relative error of the energy": _energy},
         (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
+        note=_ORDER,
     ),
     ValueScene(
         "coin",
@@ -148,5 +156,6 @@ FREE = (
         TENTHS,
         {"attitude after 2 s [rad]": _coin_angle, "relative error of the energy": _energy},
         (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
+        note=_ORDER,
     ),
 )

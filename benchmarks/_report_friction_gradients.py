@@ -64,6 +64,8 @@ FRICTION_GRADIENTS = (
         _stopped,
         ours=_MODES,
         mujoco=_PEERS,
+        note="Why: wide differences through MuJoCo average over the step in which the box stops, and come as near at"
+        " one dt; with smaller ones they go away again.",
         quick=True,
     ),
     GradientScene(

@@ -73,7 +73,8 @@ def verdict(panel: Panel) -> str:
         if worst <= 1.0 and not finer:
             ahead.append(f"{name} (never as exact)" if math.isinf(min(peer for _, peer in least)) else name)
             continue
-        texts = [f"as exact as ours in 1/{worst:.1f} of the time"] if worst > 1.0 else []
+        digits = 1 if worst > 1.1 else 3
+        texts = [f"as exact as ours in 1/{worst:.{digits}f} of the time"] if worst > 1.0 else []
         texts += ["goes on to smaller errors than ours"] if finer else []
         behind.append(f"{name} ({', '.join(texts)})")
     where = f"*{panel.ylabel}*"

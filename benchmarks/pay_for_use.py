@@ -3,13 +3,15 @@
 One thread, times on the processor, in turns, medians over rounds; ratios are medians of ratios within a round, to the
 same call with the feature absent. `idle` is there and does nothing: a body far away, a ground far below, a gradient
 recorded and not asked for, friction of the cubes on a ground that has none, or of what does not touch: should cost 2 %
-and 1 % at most. Bytes are those of the tape, per step. The last lines are importing diffsim after torch, and the
-extension module's size. Prints one CSV line each. What a feature costs where it is absent cannot be measured in one
-build: `idle` is an upper bound of it.
+and 1 % at most. Bytes are those of the tape, per step. Allocations are those of a step within a call, of whatever
+asks for memory: of twice as many steps less those of as many. The last lines are importing diffsim after torch, and
+the extension module's size. Prints one CSV line each. What a feature costs where it is absent cannot be measured in
+one build: `idle` is an upper bound of it.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import statistics
 import subprocess
@@ -23,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from _allocations import counted, run_counting
 from _common import (
     STATE_FIELDS,
     advance,
@@ -37,7 +40,7 @@ from _common import (
 import diffsim as ds
 from diffsim import _core
 
-COLUMNS = ("case", "what", "step_us", "ratio", "tape_bytes_per_step", "module_mb")
+COLUMNS = ("case", "what", "step_us", "ratio", "allocations_per_step", "tape_bytes_per_step", "module_mb")
 DT, WAYS = 0.01, ("absent", "idle", "used")
 FAR = 50.0  # [m]
 CUBES = 10
@@ -183,7 +186,25 @@ FEATURES = {
 }
 
 
-def measure(name: str, feature: Feature, steps: int, rounds: int) -> None:
+def print_allocations(steps: int) -> None:
+    """For the process that counts."""
+    for name, feature in FEATURES.items():
+        for way in WAYS:
+            sim = ds.Simulator(feature.scenes[way](), DT, num_threads=1, **feature.options[way])
+            calls = [partial(feature.call[way], sim, sim.initial_state(), count) for count in (steps, 2 * steps)]
+            for call in calls:  # what is kept from call to call is there then
+                call()
+            few, many = map(counted, calls)
+            print(name, way, (many - few) / steps, sep=",")
+
+
+def allocations(steps: int) -> dict[tuple[str, str], float]:
+    """Of a step, by feature and way."""
+    lines = run_counting([__file__, "--steps", str(steps), "--count"]).splitlines()
+    return {(name, way): float(made) for name, way, made in (line.split(",") for line in lines)}
+
+
+def measure(name: str, feature: Feature, steps: int, rounds: int, made: Mapping[tuple[str, str], float]) -> None:
     timed, tapes = {}, {}
     for way in WAYS:
         sim = ds.Simulator(feature.scenes[way](), DT, num_threads=1, **feature.options[way])
@@ -197,7 +218,8 @@ def measure(name: str, feature: Feature, steps: int, rounds: int) -> None:
     )
     for way in WAYS:
         ratio = median_ratio(seconds[way], seconds["absent"])
-        print_row([name, way, 1e6 * statistics.median(seconds[way]) / steps, ratio, tapes[way], None])
+        step_us = 1e6 * statistics.median(seconds[way]) / steps
+        print_row([name, way, step_us, ratio, made.get((name, way)), tapes[way], None])
 
 
 def import_seconds(rounds: int, quick: bool) -> float:
@@ -218,17 +240,22 @@ def main() -> int:
     parser = make_parser(__doc__, rounds=21, cpu_time=False)
     parser.set_defaults(clock=time.process_time)
     parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--count", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.quick:
         options.rounds, options.steps = 1, 5
     torch.set_num_threads(1)
+    if options.count:
+        print_allocations(options.steps)
+        return 0
     print_header(clock=options.clock)
     print_row(COLUMNS)
+    made = allocations(options.steps)
     for name, feature in FEATURES.items():
-        measure(name, feature, options.steps, options.rounds)
+        measure(name, feature, options.steps, options.rounds, made)
     size = Path(_core.__file__).stat().st_size / 1e6
     seconds = import_seconds(1 if options.quick else 5, options.quick)
-    print_row(["import", "after torch", 1e6 * seconds, None, None, size])
+    print_row(["import", "after torch", 1e6 * seconds, None, None, None, size])
     return 0
 
 

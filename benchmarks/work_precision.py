@@ -147,13 +147,13 @@ DISCRETE, CONTINUOUS = (
 
 
 def measure_gradients(case: GradientScene, report: Report, steps: tuple[float, ...], quick: bool) -> None:
-    right = continuous(case)
+    right, sizes = continuous(case), Inputs(case, case.steps[0]).sizes
 
     def add(name: str, dt: float, gradient: Any, milliseconds: float, discrete: Any = None) -> None:
         row = {"scene": case.name, "name": name, "dt_s": dt, "time_ms": milliseconds}
         if discrete is not None:
-            report.add({**row, "what": DISCRETE, "error": relative(gradient, discrete)})
-        report.add({**row, "what": CONTINUOUS, "error": relative(gradient, right)})
+            report.add({**row, "what": DISCRETE, "error": relative(gradient, discrete, sizes)})
+        report.add({**row, "what": CONTINUOUS, "error": relative(gradient, right, sizes)})
 
     for dt in steps:
         discrete: dict[str, Any] = {}  # by integrator
@@ -184,6 +184,7 @@ def section_of_gradients(case: GradientScene, report: Report) -> Section | None:
         f" {run_of(rows)}",
         f"As dt falls from {x[0]:g} to {x[-1]:g} s, the exact adjoint's error from it goes from {falls}.",
         verdict(useful),
+        *([case.note] if case.note else []),
     ]
     return Section(f"gradient_{case.name}", case.title, text, panels)
 
@@ -195,6 +196,10 @@ INTRODUCTION = (
     " forms take into account; errors of exactly 0 are drawn at the bottom.",
     "*Smooth motion*: our default steps are implicit Euler, of first order; `trapezoidal` is of second order there,"
     " keeps what free motion keeps, and pays for contact with a second solve. MuJoCo's RK4 is of fourth order.",
+    "*Why implicit Euler is the default*: where things meet, the errors of `trapezoidal` are the same (push, oblique"
+    " impact), in heaps a step takes up to 4 times as long and makes up to 3e-4 of the energy that is lost where"
+    " implicit Euler makes none (pile), and cloth keeps implicit Euler in either. Where things fly, slide and roll,"
+    " `trapezoidal` is more exact by orders in the same time: use it there.",
     "*Friction*: a stack that leans, a box that has stopped and a ball that rolls should not creep or slip at all."
     " MuJoCo's friction gives way with a speed that impratio divides; ours is exact, and slips by rounding.",
 )

@@ -10,12 +10,13 @@ seed: two by default, five by `--seeds 5`. (After Fig. 7 of Qiao et al., ICML 20
 and time step are theirs. That marble, of 8 cm radius and 4.2 g, is as light as a toy balloon; their descent had
 momentum, which only delays it.)
 
-Writes out/marble_inverse.png and checks itself: the exit code says whether all that `check` looks at holds.
+Writes out/marble_inverse.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import sys
 import time
@@ -293,9 +294,21 @@ def draw(table: Table, trials: Sequence[Trial], path: Path) -> None:
             axes.set(xlabel=over, xscale="log", yscale="log")
             axes.tick_params(axis="x", which="minor", labelbottom=False)
         middle.set_ylabel("objective [m²], mean ± one standard deviation")
-        middle.legend(frameon=False, fontsize=9)
+        middle.legend(frameon=False, fontsize=9, loc="center")
 
     save_figure(path, fill, figsize=(13.0, 4.2))
+
+
+def summary(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """For a file of results: of each target what was searched, and the force of descent [N]."""
+    return [
+        {
+            "target": trial.problem.target.tolist(),
+            "force": (math.sqrt(STEP) * trial.descent.best).tolist(),
+            "searches": {s.name: {"objectives": s.objectives, "seconds": s.seconds} for s in trial.searches},
+        }
+        for trial in trials
+    ]
 
 
 def curve(axes: Any, searches: Sequence[Search], color: str, over_seconds: bool) -> None:
@@ -328,6 +341,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{searches[0].name}: {spread} after {count} simulations, {seconds:.1f} s")
     if not options.no_picture:
         draw(table, trials, options.out / "marble_inverse.png")
+        (options.out / "marble_inverse.json").write_text(json.dumps(summary(trials)) + "\n")
     passed = check(table, trials, options.iterations)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

@@ -32,7 +32,7 @@ COLUMNS = {
     "many_objects": ("objects", "forward_backward_s", "mujoco_forward_s", "memory_mb", "mpm_s", "paper_code_s"),
     "memory": ("case", "cubes", "peak_mb", "tape_bytes_per_body_step"),
     "overhead": ("run", "nothing_forward_us", "backward_ratio"),
-    "pay_for_use": ("case", "what", "step_us", "ratio", "tape_bytes_per_step", "module_mb"),
+    "pay_for_use": ("case", "what", "step_us", "ratio", "allocations_per_step", "module_mb"),
     "relative_scale": ("scale", "forward_backward_s", "memory_mb", "most_iterations"),
     "work_precision": ("scene", "what", "name", "run", "failure", "dt_s", "time_ms", "error"),
     "threads": ("cubes", "threads", "forward_s", "backward_speedup"),

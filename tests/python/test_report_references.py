@@ -17,6 +17,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from _mujoco import Settings, contact_attributes  # noqa: E402
 from _report_free import FREE  # noqa: E402
 from _report_friction import FRICTION, PEERS, bowled, top_axis  # noqa: E402
+from _report_gradients import CONTACT_GRADIENTS, Inputs, relative  # noqa: E402
 from _report_impacts import two_balls  # noqa: E402
 from _report_motion import TRAPEZOIDAL, ValueScene, mujoco_bodies  # noqa: E402
 from _report_page import Panel, verdict  # noqa: E402
@@ -87,6 +88,15 @@ def test_an_oblique_impact_keeps_momentum_and_stops_the_approach() -> None:
     assert float(normal.norm()) == pytest.approx(1.0, rel=1e-12)
     assert float((after[1] - after[0]) @ normal) == pytest.approx(0.0, abs=1e-12)
     assert float(after[1, 1]) > 0.1  # it was struck from below
+
+
+def test_an_error_of_the_derivative_to_a_stiffness_counts_whatever_its_unit() -> None:
+    case = next(case for case in CONTACT_GRADIENTS if case.name == "sphere_on_cloth")
+    inputs = Inputs(case, case.steps[0])
+    right = inputs.adjoint()
+    without = np.where([name == "cloth_stretch" for name, _ in case.inputs], 0.0, right)
+    assert 1e-2 < relative(without, right, inputs.sizes) < 1.0
+    assert relative(without, right, np.ones(len(right))) < 1e-4  # in newtons per metre it is next to nothing
 
 
 def test_a_peer_that_is_better_is_named_with_the_number() -> None:
