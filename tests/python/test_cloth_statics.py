@@ -192,7 +192,7 @@ def elastica(length: float, load: float) -> FloatArray:
 def tip_of_clamped_strip(nx: int, ny: int, load: float, mesh: str) -> FloatArray:
     """In lengths of the strip. Clamped by two rows of pins, half way between which the bending begins."""
     length, density = 0.1, 0.2
-    h, width = length / (nx + 0.5), length / 8.0
+    h, width = length / (nx + 0.5), length / 16.0  # narrow: of what is near each other, most is across it
     vertices, faces = ds.shapes.sheet((length + 0.5 * h, width), (nx + 2, ny + 1))
     vertices[:, 0] += 0.5 * length - 0.25 * h  # from -h/2 to length
     numbers = np.arange(len(vertices)).reshape(ny + 1, nx + 2)
@@ -227,7 +227,7 @@ def test_a_clamped_strip_bends_as_the_elastica(mesh: str, load: float, falls: fl
     """Load is density g L³ / bend: at 1 it is a beam, at 20 it hangs."""
     exact = elastica(1.0, load)
     assert exact[1] > falls
-    sizes = [(4, 2), (8, 2), (16, 4), (32, 8)] if mesh == "irregular" else [(4, 1), (8, 1), (16, 2), (32, 4)]
+    sizes = [(4, 1), (8, 1), (16, 2), (32, 4)] if mesh == "irregular" else [(4, 1), (8, 1), (16, 1), (32, 2)]
     errors = [float(np.linalg.norm(tip_of_clamped_strip(*size, load, mesh) - exact)) for size in sizes]
     assert (np.array(errors[:-1]) > 2.0 * np.array(errors[1:])).all(), errors
     assert errors[-1] < error
