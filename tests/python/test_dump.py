@@ -37,9 +37,8 @@ def assert_same(a: ds.State, b: ds.State) -> None:
         assert torch.equal(getattr(b, name), value), name
 
 
-@pytest.mark.parametrize("batch", [None, 2])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_step_is_replayed_bit_by_bit(tmp_path: Path, batch: int | None, dtype: torch.dtype) -> None:
+def kept_step(path: Path, batch: int | None, dtype: torch.dtype) -> tuple[ds.Simulator, ds.State, ds.State]:
+    """A simulator, where it was when a step was kept in a file, and where that step led."""
     options = {"thickness": 2e-3, "compliance": 1e-3, "adjoint": "qr", "coupling": "split", "max_iterations": 321}
     sim = ds.Simulator(everything(), dt=0.007, tolerance=1e-9, num_threads=1, on_failure="raise", **options)
     with torch.no_grad():
@@ -51,9 +50,17 @@ def test_a_step_is_replayed_bit_by_bit(tmp_path: Path, batch: int | None, dtype:
         force=torch.full_like(state.position, 0.3), node_velocity=torch.full_like(state.node_position, 0.1)
     )
     control = only_read(sim, control)
-    path = tmp_path / "step.kept"
     diagnostics.dump(sim, state.replace(velocity=state.velocity.clone().requires_grad_()), control, path)
-    expected = sim(state, control)
+    return sim, state, sim(state, control)
+
+
+KEPT = [(batch, dtype) for batch in (None, 2) for dtype in (torch.float32, torch.float64)]
+
+
+@pytest.mark.parametrize(("batch", "dtype"), KEPT)
+def test_a_step_is_replayed_bit_by_bit(tmp_path: Path, batch: int | None, dtype: torch.dtype) -> None:
+    path = tmp_path / "step.kept"
+    sim, state, expected = kept_step(path, batch, dtype)
     kept = diagnostics.replay(path)
     assert_same(kept.state, state)
     assert kept.control is not None
@@ -66,10 +73,19 @@ def test_a_step_is_replayed_bit_by_bit(tmp_path: Path, batch: int | None, dtype:
     assert kept.sim.info.iterations == sim.info.iterations > 0
     assert kept.sim._on_failure == "raise"
     assert_same(kept.sim.initial_state(), sim.initial_state())
-    # As a user would, elsewhere.
-    code = "import sys, torch, diffsim; torch.save(diffsim.diagnostics.replay(sys.argv[1]).step(), sys.argv[2])"
-    subprocess.run([sys.executable, "-c", code, str(path), str(tmp_path / "end")], check=True)
-    assert_same(torch.load(tmp_path / "end"), expected)
+
+
+def test_another_process_replays_it(tmp_path: Path) -> None:
+    """As a user would, elsewhere."""
+    expected = [kept_step(tmp_path / str(k), *case)[-1] for k, case in enumerate(KEPT)]
+    code = """if True:
+        import sys, torch, diffsim
+        for path in sys.argv[1:]:
+            torch.save(diffsim.diagnostics.replay(path).step(), path + ".end")
+    """
+    subprocess.run([sys.executable, "-c", code, *(str(tmp_path / str(k)) for k in range(len(KEPT)))], check=True)
+    for k, end in enumerate(expected):
+        assert_same(torch.load(tmp_path / f"{k}.end"), end)
 
 
 def test_a_failed_step_of_a_batch_is_kept(tmp_path: Path) -> None:
