@@ -47,8 +47,15 @@ def point_triangle_distance(points: FloatArray, triangles: FloatArray) -> FloatA
     edges = np.full(height.shape, np.inf)
     for p, q in ((a, b), (b, c), (c, a)):
         inside &= np.einsum("...i,...i->...", np.cross(normal, q - p), points - p) >= 0.0
-        edges = np.minimum(edges, segment_segment_distance(points, points, p, q))
+        edges = np.minimum(edges, _point_segment_distance(points, p, q))
     return np.where(inside, np.abs(height), edges)
+
+
+def _point_segment_distance(points: FloatArray, p: FloatArray, q: FloatArray) -> FloatArray:
+    edge, offset = q - p, points - p
+    length_sq = np.einsum("...i,...i->...", edge, edge)
+    t = np.einsum("...i,...i->...", offset, edge) / np.where(length_sq > 0.0, length_sq, 1.0)
+    return np.asarray(np.linalg.norm(offset - np.clip(t, 0.0, 1.0)[..., None] * edge, axis=-1))
 
 
 def segment_segment_distance(p0: FloatArray, p1: FloatArray, q0: FloatArray, q1: FloatArray) -> FloatArray:
@@ -91,10 +98,13 @@ def distance_to_surface(points: FloatArray, triangles: FloatArray) -> FloatArray
     """Distance of each point (n, 3) to the nearest of the triangles (m, 3, 3), shape (n,)."""
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     result = np.empty(len(points))
-    for index, point in enumerate(points):
+    rows = max(1, _CHUNK // max(1, len(triangles)))
+    for begin in range(0, len(points), rows):
+        some = points[begin : begin + rows, None]
         # No further than the nearest corner: only triangles whose box comes that near are measured.
-        bound_sq = np.square(triangles[:, 0] - point).sum(axis=1).min()
-        gap = np.maximum(np.maximum(low - point, point - high), 0.0)
-        near = np.square(gap).sum(axis=1) <= bound_sq
-        result[index] = point_triangle_distance(point, triangles[near]).min()
+        bound_sq = np.square(triangles[:, 0] - some).sum(axis=-1).min(axis=1, keepdims=True)
+        gap = np.maximum(np.maximum(low - some, some - high), 0.0)
+        point, triangle = np.nonzero(np.square(gap).sum(axis=-1) <= bound_sq)
+        distance = point_triangle_distance(some[point, 0], triangles[triangle])
+        result[begin : begin + rows] = np.minimum.reduceat(distance, np.searchsorted(point, np.arange(len(some))))
     return result
