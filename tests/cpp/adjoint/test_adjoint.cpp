@@ -323,19 +323,25 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
         // What the loss sees of pinned nodes is their own motion, which is not the adjoint's part.
         const VectorX weights = flatten(without_pinned(zone, upstream));
         const auto loss = [&](const Scene& changed) { return weights.dot(changed.solution()); };
-        const auto numeric = [&](double step, Eigen::Index size, const auto& change) {
+        const auto numeric = [&](double step, const auto& change) {
             const auto at = [&](const VectorX& x) {
                 Scene changed = scene;
-                change(changed, x);
+                change(changed, x[0]);
                 return loss(changed);
             };
-            return fixtures::numeric_gradient(at, VectorX::Zero(size), step);
+            return fixtures::numeric_gradient(at, VectorX::Zero(1), step)[0];
         };
+        // Of vectors one direction each: a solve takes long.
+        check::Random random(10);
+        const Vec6 twist = random.vector(6).normalized();
+        const Vec3 shift = random.vector(3).normalized();
         Vec6 by_target;
         const Vec6& z = adjoint.multiplier.bodies[0];
         by_target << scene.bodies[0].inertia * z.head<3>(), scene.bodies[0].mass * z.tail<3>();
+        CHECK(by_target.norm() > 1e-2);
         CHECK_NEAR(
-            by_target, numeric(kStep, 6, [](Scene& s, const VectorX& x) { s.bodies[0].target += x; }), kDifferences);
+            by_target.dot(twist), numeric(kStep, [&](Scene& s, double x) { s.bodies[0].target += x * twist; }),
+            kDifferences);
 
         const double scale = flatten(adjoint.pose_gradient).norm();
         CHECK(scale > 0.1);
@@ -350,15 +356,16 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
                 const ZoneNode& node = zone.nodes[i];
                 const Vec3& z_node = adjoint.multiplier.nodes[i];
                 const Vec3 &place = adjoint.pose_gradient.nodes[i], &start = adjoint.start_gradient[i];
-                const VectorX targeted =
-                    numeric(kStep, 3, [&](Scene& s, const VectorX& x) { s.sheets[sheet].target[k] += x; });
-                CHECK_NEAR(node.pinned ? place : Vec3(node.mass * z_node), targeted, kDifferences * (1.0 + scale));
-                const VectorX started =
-                    numeric(kStep, 3, [&](Scene& s, const VectorX& x) { s.sheets[sheet].start[k] += x; });
-                CHECK_NEAR(place + start, started, kDifferences * (1.0 + scale));
+                const Vec3 by_node_target = node.pinned ? place : Vec3(node.mass * z_node);
+                const double targeted =
+                    numeric(kStep, [&](Scene& s, double x) { s.sheets[sheet].target[k] += x * shift; });
+                CHECK_NEAR(by_node_target.dot(shift), targeted, kDifferences * (1.0 + scale));
+                const double started =
+                    numeric(kStep, [&](Scene& s, double x) { s.sheets[sheet].start[k] += x * shift; });
+                CHECK_NEAR((place + start).dot(shift), started, kDifferences * (1.0 + scale));
                 const double by_mass = adjoint.node_mass_gradient[i] - z_node.dot(point.y.nodes[i] - node.target);
-                const double weighed = numeric(
-                    1e-3 * node.mass, 1, [&](Scene& s, const VectorX& x) { s.sheets[sheet].mass[k] += x[0]; })[0];
+                const double weighed =
+                    numeric(1e-3 * node.mass, [&](Scene& s, double x) { s.sheets[sheet].mass[k] += x; });
                 CHECK_NEAR(by_mass, weighed, 1e-4 * std::abs(by_mass) + 1e-7);
                 by_stiffness += std::abs(adjoint.node_mass_gradient[i]);
             }
@@ -369,8 +376,8 @@ TEST(exact_adjoint_with_cloth_agrees_with_differences_of_the_solve) {
                 {&ClothParameters::damping, adjoint.cloth_gradient[sheet].damping}};
             for (const auto& [field, analytic] : fields) {
                 const double value = scene.materials[sheet].*field;
-                const double by_difference = numeric(
-                    1e-4 * value, 1, [&, f = field](Scene& s, const VectorX& x) { s.materials[sheet].*f += x[0]; })[0];
+                const double by_difference =
+                    numeric(1e-4 * value, [&, f = field](Scene& s, double x) { s.materials[sheet].*f += x; });
                 CHECK(analytic != 0.0);
                 CHECK_NEAR(analytic * value, by_difference * value, 1e-4 * std::abs(analytic * value) + 1e-9);
             }
