@@ -79,8 +79,9 @@ std::vector<double> solve(
     return zone.exact_contact ? find_reactions(zone, point, upstream, solve_in_place, z) : std::vector<double>();
 }
 
-/// What the contacts of a body that yields take of the upstream gradient v, along its twist J dy at the end of the step.
-/// With H = M + C + Jᵀ K J the matrix of  H z = v,  K of the contacts and C the curvature of the chart under their torque:
+/// What the contacts of a body that yields take of the upstream gradient v, along its twist J dy at the end
+/// of the step. With H = M + C + Jᵀ K J the matrix of  H z = v,  K of the contacts and C the curvature of
+/// the chart under their torque:
 ///     K J z + Jᵀ⁻¹ (M + C) z = Jᵀ⁻¹ v.
 /// Of exact contacts, whose reactions stand beside H z, they are part of it.
 Vec6 contact_share(const ZoneBody& body, const Vec6& y, const Vec3& torque, const Vec6& v, const Vec6& z) {

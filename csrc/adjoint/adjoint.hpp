@@ -24,8 +24,8 @@ struct GradientNeeds {
 
 struct ZoneAdjoint {
     Coordinates multiplier;  ///< z, one per dynamic body and node; zero at pinned nodes
-    /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone, those
-    /// that do not yield included, along its twist at the end of the step; one per node.
+    /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone,
+    /// those that do not yield included, along its twist at the end of the step; one per node.
     Coordinates pose_gradient;
     /// Through slips, when what moves as told goes further and ends where it did: one per body that does not yield and
     /// pinned node, along its motion.
@@ -50,9 +50,10 @@ struct AdjointWorkspace {
     ZoneAdjoint result;
 };
 
-/// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution. `friction`: of the
-/// active contacts, empty in a zone without; in mode exact only, and not of exact contacts. `upstream` has one
-/// entry per dynamic body and node; those of pinned nodes are not used. The result is the workspace's, until its next use.
+/// `zone.contacts` need hold the active contacts only; `point` is the zone evaluated at the solution.
+/// `friction`: of the active contacts, empty in a zone without; in mode exact only, and not of exact contacts.
+/// `upstream` has one entry per dynamic body and node; those of pinned nodes are not used. The result is the
+/// workspace's, until its next use.
 const ZoneAdjoint& zone_adjoint(
     const Zone& zone, const ZonePoint& point, const std::vector<ContactFriction>& friction, const Coordinates& upstream,
     AdjointMode mode, const GradientNeeds& needs, AdjointWorkspace& workspace);

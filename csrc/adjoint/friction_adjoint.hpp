@@ -11,9 +11,9 @@
 ///     K dy + B dλ = -dF,  C dy = -ds.
 /// K is not symmetric, and C is not Bᵀ, since contacts move with what they touch. The transpose,
 ///     Kᵀ z + Cᵀ ζ = v,  Bᵀ z = 0,
-/// is solved by GMRES for z and ζ together, with the factor of a symmetric matrix: H, what of friction is symmetric, and
-/// springs along the slips of sticking contacts. Rows that depend on each other leave ζ open: each round gives the second
-/// equation a little of ζ, and the next one takes the error that this makes.
+/// is solved by GMRES for z and ζ together, with the factor of a symmetric matrix: H, what of friction is symmetric,
+/// and springs along the slips of sticking contacts. Rows that depend on each other leave ζ open: each round gives the
+/// second equation a little of ζ, and the next one takes the error that this makes.
 namespace diffsim {
 
 class FrictionAdjoint {
@@ -23,8 +23,8 @@ public:
 
     bool empty() const { return m_terms.empty(); }
 
-    /// Overwrite the upstream gradient v by z. `system` holds H, whose factor is not made yet, and is used up. False where it
-    /// is not positive definite even with friction.
+    /// Overwrite the upstream gradient v by z. `system` holds H, whose factor is not made yet, and is used up. False
+    /// where it is not positive definite even with friction.
     bool solve(BlockSystem& system, Coordinates& z);
 
     /// H z: the upstream gradient without what friction takes of it.

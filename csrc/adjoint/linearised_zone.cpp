@@ -46,8 +46,8 @@ private:
     std::vector<Eigen::Index> m_rows;
 };
 
-/// The contacts as rows of the paper's J, in the free coordinates, and their stiffness. Parallel edges have none, and no
-/// row.
+/// The contacts as rows of the paper's J, in the free coordinates, and their stiffness.
+/// Parallel edges have none, and no row.
 struct Rows {
     MatrixX J;                           // m x n
     VectorX stiffness;                   // m [kg]

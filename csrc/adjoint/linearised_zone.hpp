@@ -8,7 +8,8 @@
 namespace diffsim {
 
 /// What dense and qr solve, (A + Jᵀ K J) z = v, over the free coordinates: six per dynamic body, three per node that is
-/// not pinned. The same as the KKT system of [Qiao et al. 2020, Eq. 9] with the compliance 1/K as its lower right block.
+/// not pinned. The same as the KKT system of [Qiao et al. 2020, Eq. 9] with the compliance
+/// 1/K as its lower right block.
 struct LinearisedZone {
     std::vector<int> bodies;  ///< whose coordinates they are: indices into Model::bodies
     std::vector<int> nodes;   ///< and cloth nodes of the scene
@@ -20,8 +21,8 @@ struct LinearisedZone {
 /// `zone` and `point` as for zone_adjoint.
 LinearisedZone linearise(const Zone& zone, const ZonePoint& point);
 
-/// Of [ A  Jᵀ ; J  -1/stiffness ] [z; λ] = [v; 0], A inertia and elasticity [Qiao et al. 2020, Eq. 9, its constraint rows
-/// softened]. λ is stiffness J z, but computed from that it would lose the digits by which J z is smaller than z.
+/// Of [ A  Jᵀ ; J  -1/stiffness ] [z; λ] = [v; 0], A inertia and elasticity [Qiao et al. 2020, Eq. 9, its constraint
+/// rows softened]. λ is stiffness J z, but computed from that it would lose the digits by which J z is smaller than z.
 struct KktSolution {
     Coordinates z;
     VectorX multipliers;

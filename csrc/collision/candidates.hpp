@@ -24,8 +24,8 @@ struct SweptMesh {
     const BoxTree* tree = nullptr;
 };
 
-/// A mesh in motion with boxes around its vertices and the nodes of its tree. Each is made when first asked for, and serves
-/// all pairs with the mesh.
+/// A mesh in motion with boxes around its vertices and the nodes of its tree. Each is made when first asked for, and
+/// serves all pairs with the mesh.
 class SweptBoxes {
 public:
     SweptBoxes() = default;
@@ -69,8 +69,8 @@ void collect_self_pairs(const SweptMesh& swept, std::vector<FeaturePair>& pairs)
 /// pair. Of one mesh with itself, whose features move at the same time: give it twice.
 void drop_distant_pairs(const SweptMesh& a, const SweptMesh& b, std::vector<FeaturePair>& pairs);
 
-/// Whether the surfaces of two meshes go through each other where their motions begin: a side of a patch of one through a
-/// patch of the other. One mesh wholly inside another does not count, nor do points, nor two segments.
+/// Whether the surfaces of two meshes go through each other where their motions begin: a side of a patch of one through
+/// a patch of the other. One mesh wholly inside another does not count, nor do points, nor two segments.
 bool meshes_cross(const SweptMesh& a, const SweptMesh& b);
 
 /// The same within one deforming mesh; sides and patches that share a vertex do not count.

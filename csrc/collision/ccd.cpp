@@ -46,8 +46,8 @@ struct Features {
     double extent;  ///< bound on the coordinates of all vertices, relative to the first
 };
 
-/// How long from `time` on the plane with the fixed normal n keeps the features this far apart, or infinity if until the
-/// time `until` at least; exact.
+/// How long from `time` on the plane with the fixed normal n keeps the features this far apart, or infinity if until
+/// the time `until` at least; exact.
 double fixed_reach(const Features& features, const Vec3& n, double time, double until, double keep) {
     double reach = kInfinity;
     for (int i = 0; i < features.count_a; ++i) {

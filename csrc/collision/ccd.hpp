@@ -4,13 +4,13 @@
 
 /// Conservative continuous collision detection between features whose vertices move on straight lines.
 ///
-/// Where a plane keeps two convex features apart, they do not meet. Each advance takes the plane normal to the offset of
-/// the closest points and goes on for as long as it separates all vertices by the distance to keep: with its direction
-/// fixed first, which is enough for whatever slides, falls or flies past, then with the direction turning as the features
-/// do. The normal of a face, of two edges, or from an edge to a vertex is a polynomial in time, and so are the distances
-/// of all vertices along it: bounds of polynomials say how long the plane separates. The cost grows with the logarithm of
-/// motion over tolerance. No roots of cubics, nothing to misjudge when they are nearly multiple, and nothing rests on how
-/// well closest points are found: what a plane separates is tested for every vertex.
+/// Where a plane keeps two convex features apart, they do not meet. Each advance takes the plane normal to the offset
+/// of the closest points and goes on for as long as it separates all vertices by the distance to keep: with its
+/// direction fixed first, which is enough for whatever slides, falls or flies past, then with the direction turning as
+/// the features do. The normal of a face, of two edges, or from an edge to a vertex is a polynomial in time, and so are
+/// the distances of all vertices along it: bounds of polynomials say how long the plane separates. The cost grows with
+/// the logarithm of motion over tolerance. No roots of cubics, nothing to misjudge when they are nearly multiple, and
+/// nothing rests on how well closest points are found: what a plane separates is tested for every vertex.
 namespace diffsim {
 
 struct CcdOptions {

@@ -37,14 +37,15 @@ struct Contact {
     }
 };
 
-/// What the multiplier of an exact contact follows from: it acts as one with this compliance and its rest distance shifted.
+/// What the multiplier of an exact contact follows from: it acts as one with this compliance
+/// and its rest distance shifted.
 struct ExactContact {
     double shift;  ///< [m]
     double compliance;
 };
 
-/// Where the surface of an object is: at a pose, or, for cloth, at its nodes. Of a body with both, `nodes` are the vertices
-/// that are needed, placed.
+/// Where the surface of an object is: at a pose, or, for cloth, at its nodes. Of a body with both, `nodes` are the
+/// vertices that are needed, placed.
 struct Surface {
     const CollisionMesh* mesh = nullptr;
     const Pose* pose = nullptr;

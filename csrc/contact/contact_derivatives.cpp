@@ -11,9 +11,9 @@
 namespace diffsim {
 namespace {
 
-/// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|, of which a closest
-/// point has as many as its count. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector on what is
-/// orthogonal to S and n:
+/// Add, times a factor, the second derivative of the distance d = min over the slides s of |w(y, s)|, of which a
+/// closest point has as many as its count. With W = dw/dy, S = dw/ds, G = (SᵀS)⁻¹, q = n · dS/dy, and N the projector
+/// on what is orthogonal to S and n:
 ///     WᵀNW/d - WᵀSGq - (WᵀSGq)ᵀ - d qᵀGq + n · d²w/dy²  =  WᵀNW/d - X - Xᵀ + n · d²w/dy²,  X = (SᵀW + ½ d q)ᵀ G q.
 /// A slide of one object changes its direction with the coordinates of that object alone. All but n · d²w/dy² is added.
 template <class A, class B>
@@ -69,9 +69,9 @@ void add_slide_hessian(
     }
 }
 
-/// The same, whole. On the border of its feature a point slides one way alone, and the second derivative is another one on
-/// either side: their mean is taken. Where two equal edges lie side by side, an end of one leaves the other as an end of
-/// that one comes onto it: the sum over the contacts is the same on both sides, and the sum of the means is it.
+/// The same, whole. On the border of its feature a point slides one way alone, and the second derivative is another one
+/// on either side: their mean is taken. Where two equal edges lie side by side, an end of one leaves the other as an
+/// end of that one comes onto it: the sum over the contacts is the same on both sides, and the sum of the means is it.
 template <class A, class B>
 void add_distance_hessian(
     const ContactGeometry& geometry, const A& a, const B& b, double factor,
@@ -91,7 +91,8 @@ void add_distance_hessian(
     }
 }
 
-/// The squared sine c = 1 - g² of the angle between two edges, through their cosine g. Shifts of bodies do not change it.
+/// The squared sine c = 1 - g² of the angle between two edges, through their cosine g.
+/// Shifts of bodies do not change it.
 template <class A, class B>
 struct Angle {
     static constexpr int kA = A::kTurnSize, kB = B::kTurnSize;

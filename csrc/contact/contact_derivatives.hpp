@@ -3,8 +3,8 @@
 #include "contact/sides.hpp"
 #include "math/half_symmetric.hpp"
 
-/// Derivatives of a contact's energy along the coordinates of its two sides. Second derivatives of a body are those of its
-/// twist's chart at phi = 0, hence symmetric.
+/// Derivatives of a contact's energy along the coordinates of its two sides. Second derivatives of a body are those of
+/// its twist's chart at phi = 0, hence symmetric.
 namespace diffsim {
 
 /// The energy's first derivative along the coordinates of a and of b, and what it is made of.
@@ -35,14 +35,14 @@ ContactDerivatives<A::kSize + B::kSize> contact_derivatives(
     const ContactGeometry& geometry, const ContactLaw& law, const A& a, const B& b, bool with_hessian,
     bool with_curvature);
 
-/// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. The second derivative is
-/// added to `hessian`, unless that is null.
+/// The same of two bodies along (turn of a, turn of b, shift of b against a), all that matters. The second derivative
+/// is added to `hessian`, unless that is null.
 ContactForce<9> add_relative_derivatives(
     const ContactGeometry& geometry, const ContactLaw& law, const BodySide& a, const BodySide& b, bool with_curvature,
     HalfSymmetric<9>* hessian);
 
-/// The same for a contact that pushes with a force of its own, whatever its distance, as a row of a ContactModel does: the second
-/// derivative is -force d²(distance).
+/// The same for a contact that pushes with a force of its own, whatever its distance, as a row of a ContactModel does:
+/// the second derivative is -force d²(distance).
 ContactForce<9> add_relative_curvature(
     const ContactGeometry& geometry, double force, const BodySide& a, const BodySide& b, HalfSymmetric<9>& hessian);
 template <class A, class B>

@@ -6,8 +6,8 @@
 namespace diffsim {
 
 double rest_shift(double force, double pole, double stiffness) {
-    // phi' at p = s, P = pole + s, is k s (1 + s / pole) (1 + s / (2 pole)): at least its linear and its cubic term, and convex,
-    // so that Newton's method comes down to the solution from the right.
+    // phi' at p = s, P = pole + s, is k s (1 + s / pole) (1 + s / (2 pole)): at least its linear and its cubic term,
+    // and convex, so that Newton's method comes down to the solution from the right.
     double shift = std::min(force / stiffness, std::cbrt(2.0 * force / stiffness * pole * pole));
     for (;;) {
         const double ratio = shift / pole;

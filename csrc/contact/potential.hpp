@@ -23,8 +23,8 @@ inline PotentialValue contact_potential(double compression, double pole, double 
     return {0.5 * linear * compression, linear * growth * (1.0 - 0.5 * ratio), stiffness * growth * growth * growth};
 }
 
-/// How far the rest distance of a contact with this pole has to be shifted, its pole staying where it is, for this force to
-/// act where the rest distance was.
+/// How far the rest distance of a contact with this pole has to be shifted, its pole staying where it is, for this
+/// force to act where the rest distance was.
 double rest_shift(double force, double pole, double stiffness);
 
 /// Factor on the energy of a pair of edges, a function of the squared sine c of their angle:

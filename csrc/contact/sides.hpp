@@ -9,8 +9,8 @@
 /// The two sides of a contact, and how each moves its closest point and the directions of its feature.
 ///
 /// A rigid body moves along its twist at its current pose, (turn, shift): a turn phi moves x -> Exp(phi) (x - t) + t
-/// about the centre of mass t. Cloth moves with the three nodes of a feature; an edge and a vertex use the first two and
-/// the first. The ground does not move.
+/// about the centre of mass t. Cloth moves with the three nodes of a feature; an edge and a vertex use the first two
+/// and the first. The ground does not move.
 namespace diffsim {
 
 /// A contact on a rigid body.
@@ -35,8 +35,8 @@ struct GroundSide {
 /// What a cloth's feature contributes to a contact: where on it the closest point lies.
 ClothSide cloth_side(const ClosestPoint& closest, const Vec3& normal, const Feature& feature, const Surface& cloth);
 
-/// Orthonormal directions along which a closest point slides on its object, as many as its count says. On the border of a
-/// face the first runs along it.
+/// Orthonormal directions along which a closest point slides on its object, as many as its count says. On the border of
+/// a face the first runs along it.
 std::array<Vec3, 2> slide_directions(const ClosestPoint& closest, const Vec3& normal);
 
 template <int N>
@@ -49,8 +49,8 @@ inline Mat3 turn_curvature(const Vec3& r, const Vec3& n) {
     return m;
 }
 
-/// How the turn of a rigid body moves the closest point on it and the directions of its features. Of two bodies only their
-/// relative shift matters, so that of one of them the turn is enough.
+/// How the turn of a rigid body moves the closest point on it and the directions of its features. Of two bodies only
+/// their relative shift matters, so that of one of them the turn is enough.
 class TurnMotion {
 public:
     static constexpr int kSize = 3;

@@ -54,16 +54,16 @@ ClothParameters add_elastic_backward(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
     const Vec3* x_start, const Vec3* direction, double scale, Vec3* grad_x_start);
 
-/// How much of what can make a second derivative indefinite is cut off. kNothingCut leaves the exact one. kAllCut leaves a
-/// positive semidefinite one:
+/// How much of what can make a second derivative indefinite is cut off. kNothingCut leaves the exact one. kAllCut
+/// leaves a positive semidefinite one:
 ///  - Triangles: blocks (∂ε/∂xi)ᵀ C (∂ε/∂xj), always semidefinite, plus (giᵀ S gj) 1 with the stress S and the
 ///    gradients g of the shape functions. Along the triangle's normal the latter stands alone, so that the whole is
 ///    semidefinite exactly when S is: the negative part of S is cut off, for a square root. Clamping the
 ///    eigenvalues of the 9 x 9 matrix would differ within the triangle's plane, by the cut stress beside the stiffness,
 ///    which is of the order of the strain.
 ///  - Bending: bend Σ W_ij ∇θ_i ∇θ_jᵀ, semidefinite as a sum over all hinges and couplings, plus Σ moment_i ∇²θ_i. Any
-///    moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ with that away from the edge, against which
-///    the hinge has no stiffness. The moments' term is cut off.
+///    moment makes it indefinite, since ∇²θ couples a corner's motion along ∇θ with that away from the edge, against
+///    which the hinge has no stiffness. The moments' term is cut off.
 /// Clamping eigenvalues instead would take some 4 µs per triangle and 7 µs per hinge, thirty times as long or more.
 /// A share between them cuts off that part of it, and is semidefinite where enough is.
 using CutShare = double;
@@ -78,8 +78,8 @@ struct TriangleHessian {
     auto block(int row, int column) const { return matrix.block<3, 3>(3 * row, 3 * column); }
 };
 
-/// The part of a hinge and of its couplings to later ones: block(r, s), in the rows of nodes[r] and the columns of nodes[s],
-/// and its transpose in the rows of nodes[s], summed over r < 4 and all s.
+/// The part of a hinge and of its couplings to later ones: block(r, s), in the rows of nodes[r] and the columns of
+/// nodes[s], and its transpose in the rows of nodes[s], summed over r < 4 and all s.
 struct HingeHessian {
     std::vector<int> nodes;     ///< of the cloth: the hinge's four, then those of other hinges
     Mat34 gradient;             ///< of the hinge's angle, ∇θ_i

@@ -25,7 +25,8 @@ struct FreeRotationGradient {
     Mat3 inertia_body = Mat3::Zero();  ///< symmetric
 };
 
-/// Gradient of a loss with gradients grad_angular_velocity and grad_rotation at the result; of the inertia if asked for.
+/// Gradient of a loss with gradients grad_angular_velocity and grad_rotation at the
+/// result; of the inertia if asked for.
 FreeRotationGradient free_rotation_backward(
     const Mat3& R0, const Vec3& angular_velocity, const Vec3& torque, const Mat3& inertia_body, double dt,
     const FreeRotation& result, const Vec3& grad_angular_velocity, const Vec3& grad_rotation, bool with_inertia);

@@ -25,9 +25,9 @@ inline Vec3 initial_guess(const Mat3& inertia_world, const Vec3& angular_velocit
     return angular_velocity + inertia_world.llt().solve(dt * torque);
 }
 
-/// Newton's method from a guess, run until rounding stops it: the best of its iterates. evaluate(unknown, iterate) fills one in
-/// and returns its residual, a difference of numbers of size `scale`, one of which is the momentum; jacobian(iterate) is
-/// the residual's.
+/// Newton's method from a guess, run until rounding stops it: the best of its iterates. evaluate(unknown, iterate)
+/// fills one in and returns its residual, a difference of numbers of size `scale`, one of which is the momentum;
+/// jacobian(iterate) is the residual's.
 template <typename Substep, typename Evaluate, typename Jacobian>
 Substep newton_substep(
     const Vec3& guess, const Vec3& momentum, double scale, const Evaluate& evaluate, const Jacobian& jacobian) {
@@ -49,8 +49,8 @@ Substep newton_substep(
     return best;
 }
 
-/// Through rotation = log(R1 R0ᵀ): a turn phi of R1 moves it by J⁻¹ phi, a turn of R0 by -J⁻¹ Exp phi. Returns the covector of
-/// R1 and takes that of R0 from `of_start`.
+/// Through rotation = log(R1 R0ᵀ): a turn phi of R1 moves it by J⁻¹ phi, a turn of R0 by -J⁻¹ Exp phi. Returns the
+/// covector of R1 and takes that of R0 from `of_start`.
 inline Vec3 log_rotation_backward(const Vec3& rotation, const Vec3& grad_rotation, Vec3& of_start) {
     const Vec3 covector = left_jacobian(rotation).transpose().partialPivLu().solve(grad_rotation);
     of_start -= exp_rotation(rotation).transpose() * covector;

@@ -12,14 +12,14 @@ namespace diffsim {
 struct ClosestPoint {
     Vec3 point;
     int slide_count = 0;  ///< 0 at a vertex, 1 on an edge, 2 inside a face
-    /// How many of these directions the point can follow one way alone, because up to rounding it is on the border of its
-    /// feature: what would move it the other way leaves it there.
+    /// How many of these directions the point can follow one way alone, because up to rounding it is on the border of
+    /// its feature: what would move it the other way leaves it there.
     int border_count = 0;
     /// The edge from its first end to its second, where the count is 1 or the point is on the border of a face; of two
     /// edges always.
     Vec3 edge;
-    /// Where it is on its feature. Of an edge: 0 at its first end, 1 at its second, 2 between. Of a polygon: 0 inside, else
-    /// 1 + 3 k at corner k, 2 more on the edge that begins there.
+    /// Where it is on its feature. Of an edge: 0 at its first end, 1 at its second, 2 between. Of a polygon: 0 inside,
+    /// else 1 + 3 k at corner k, 2 more on the edge that begins there.
     std::uint32_t code = 0;
 };
 

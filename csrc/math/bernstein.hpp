@@ -5,8 +5,8 @@
 #include <cstddef>
 #include <type_traits>
 
-/// Polynomials on [0, 1] by their Bernstein coefficients: every value is a weighted mean of them, the first and the last
-/// are the values at the ends. An array of n coefficients is a polynomial of degree n - 1.
+/// Polynomials on [0, 1] by their Bernstein coefficients: every value is a weighted mean of them, the first and the
+/// last are the values at the ends. An array of n coefficients is a polynomial of degree n - 1.
 namespace diffsim {
 
 namespace detail {

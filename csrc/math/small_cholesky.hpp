@@ -16,8 +16,8 @@ void unrolled(const Body& body) {
     }
 }
 
-/// Factors A = L D Lᵀ of a small positive definite matrix, of a size known to the compiler. Without roots, which would take
-/// as long as all else.
+/// Factors A = L D Lᵀ of a small positive definite matrix, of a size known to the compiler. Without roots, which
+/// would take as long as all else.
 template <int N>
 class SmallCholesky {
 public:

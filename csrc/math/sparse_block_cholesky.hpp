@@ -38,9 +38,9 @@ public:
     /// nothing.
     void solve_in_place(double* x) const;
 
-    /// L⁻¹ b  of a right-hand side b with few blocks that are not zero: their numbers, and the values block by block. Needs a
-    /// successful factorize(). It takes a small part of the time of solve_in_place(), that of the factor's columns which
-    /// these blocks reach.
+    /// L⁻¹ b  of a right-hand side b with few blocks that are not zero: their numbers, and the values block by block.
+    /// Needs a successful factorize(). It takes a small part of the time of solve_in_place(), that of the factor's
+    /// columns which these blocks reach.
     void half_solve(const std::vector<int>& blocks, const double* values, HalfSolution& result) const;
 
     int rows() const { return m_row_count; }

@@ -83,8 +83,8 @@ std::vector<int> postorder(const std::vector<int>& parent) {
     return result;
 }
 
-/// Time to eliminate a front, in about processor cycles, measured. The result is not sensitive to them: without those per
-/// front and tile, or with three times as much, factorizations took at most a tenth longer.
+/// Time to eliminate a front, in about processor cycles, measured. The result is not sensitive to them: without those
+/// per front and tile, or with three times as much, factorizations took at most a tenth longer.
 double elimination_cost(int width, int below) {
     constexpr double kPerFront = 300.0, kPerTile = 25.0, kPerTileColumn = 8.0, kPerUpdateTile = 25.0;
     const double w = padded_to_tiles(width) / kCholeskyTile, b = padded_to_tiles(below) / kCholeskyTile;

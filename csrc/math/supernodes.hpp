@@ -6,8 +6,8 @@
 
 namespace diffsim {
 
-/// Which blocks of a symmetric matrix may be non-zero. The neighbours of block i stand at start[i] to start[i + 1] - 1, and
-/// beside each the number of the pair that it comes from.
+/// Which blocks of a symmetric matrix may be non-zero. The neighbours of block i stand at start[i] to start[i + 1] - 1,
+/// and beside each the number of the pair that it comes from.
 struct BlockGraph {
     std::vector<int> start, neighbor, pair;
 };
@@ -24,8 +24,8 @@ struct Supernodes {
     std::vector<int> below;   ///< scalar rows of the factor below these columns' own
 };
 
-/// An order of elimination with little fill and its supernodes: by minimum degree, or by nested dissection where that is
-/// faster, which it mostly is from some thousand blocks on. sizes: rows of each block.
+/// An order of elimination with little fill and its supernodes: by minimum degree, or by nested dissection where that
+/// is faster, which it mostly is from some thousand blocks on. sizes: rows of each block.
 Supernodes find_supernodes(const BlockGraph& graph, const std::vector<int>& sizes);
 
 /// The blocks below each supernode, by their places in the order, ascending: row[start[s]] to row[start[s + 1] - 1].

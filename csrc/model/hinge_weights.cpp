@@ -13,8 +13,8 @@ using Vec2 = Eigen::Vector2d;
 /// values. Small meshes and corners tell less than three; on irregular meshes ratios are 0.3 and more.
 constexpr double kLeastTold = 0.05 * 0.05;
 
-/// Couplings below this part of the hinges' own weights are left out. Those of regular grids vanish but for rounding, that of
-/// their coordinates in a single precision file included, and each would cost up to 16 blocks of the Hessian.
+/// Couplings below this part of the hinges' own weights are left out. Those of regular grids vanish but for rounding,
+/// that of their coordinates in a single precision file included, and each would cost up to 16 blocks of the Hessian.
 constexpr double kLeastCoupling = 1e-5;
 
 /// A symmetric tensor as (11, 22, √2 12), so that the dot product is the tensors' own.
@@ -63,9 +63,9 @@ struct EdgeCoefficients {
     }
 };
 
-/// A hinge on the surface w = ½ xᵀ κ x. With the corners at heights h and feet s along the edge of length l, the slope in
-/// the direction n is ½ h_a κ_nn + s_a κ_nt + q_a κ_tt on side a and -(½ h_b κ_nn - s_b κ_nt + q_b κ_tt) on side b, with
-/// q = ½ s (s - l) / h, and ½ l κ_nt in the middle of the edge.
+/// A hinge on the surface w = ½ xᵀ κ x. With the corners at heights h and feet s along the edge of length l, the slope
+/// in the direction n is ½ h_a κ_nn + s_a κ_nt + q_a κ_tt on side a and -(½ h_b κ_nn - s_b κ_nt + q_b κ_tt) on side b,
+/// with q = ½ s (s - l) / h, and ½ l κ_nt in the middle of the edge.
 struct FlatHinge {
     double length;
     EdgeCoefficients angle;      ///< slope of a minus slope of b

@@ -17,9 +17,9 @@
 /// surface of constant curvature the middle has the mean slope of the two sides only where these are each other's
 /// image under half a turn; elsewhere κ_T would be off, by 10 % on good irregular meshes, by 100 % in the twist of
 /// grids with alternating diagonals. So φ is what the middle's slope differs from the mean by, on the surface
-/// of constant curvature that comes nearest to the angles of the (up to five) hinges of the two triangles. κ_T is then exact for
-/// constant curvature on any flat mesh. Where both hold, W θ gives the moments of constant curvature exactly, and the
-/// sheet has no way to yield to them by folding, as hinges without couplings have.
+/// of constant curvature that comes nearest to the angles of the (up to five) hinges of the two triangles. κ_T is then
+/// exact for constant curvature on any flat mesh. Where both hold, W θ gives the moments of constant curvature exactly,
+/// and the sheet has no way to yield to them by folding, as hinges without couplings have.
 ///
 /// An edge of one triangle has no hinge: the slope there is free, and goes where it costs least.
 namespace diffsim {
@@ -35,8 +35,8 @@ struct HingeWeights {
     std::vector<HingeCoupling> couplings;  ///< sorted by a, then b
 };
 
-/// A hinge at rest: nodes as in ClothHinge, and the triangles with the corners nodes[2] and nodes[3]. Its angle has the sign
-/// that geometry/dihedral.hpp gives it, from the order of the nodes alone; W accounts for that.
+/// A hinge at rest: nodes as in ClothHinge, and the triangles with the corners nodes[2] and nodes[3]. Its angle has the
+/// sign that geometry/dihedral.hpp gives it, from the order of the nodes alone; W accounts for that.
 struct RestHinge {
     std::array<int, 4> nodes;
     std::array<int, 2> triangles;

@@ -85,7 +85,8 @@ struct Options {
     int max_iterations = 200;                  ///< Newton steps per zone and step
     bool split = false;        ///< cloth moves without contact first, then contacts act on its nodes (split coupling)
     bool global_zone = false;  ///< all that yields is one zone, whether it meets or not
-    /// Newton iterates that make up the elastic pass of split coupling, 1 for Eq. 3 of [qiao2020scalable]; none: it converges.
+    /// Newton iterates that make up the elastic pass of split coupling, 1 for Eq. 3 of
+    /// [qiao2020scalable]; none: it converges.
     std::optional<int> newton_iterations;
     Integrator integrator = Integrator::implicit_euler;
     StepPart part = StepPart::whole;  ///< set by the step itself

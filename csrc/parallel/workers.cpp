@@ -115,8 +115,8 @@ void Workers::wait_until(const Ready& ready, const std::function<void()>& while_
     --m_sleeping;
 }
 
-/// What is waited for may have come true. Sleepers announce themselves before they look a last time: either they see it,
-/// or they are seen here.
+/// What is waited for may have come true. Sleepers announce themselves before they look a last time: either they
+/// see it, or they are seen here.
 void Workers::wake() {
     if (m_sleeping == 0) return;
     {

@@ -18,8 +18,8 @@ namespace diffsim {
 /// sleep, and a loop never waits for one to wake up: whoever is awake takes the next range.
 class Workers {
 public:
-    /// Each thread but the owner's calls `at_end` with its number before it ends. The owner calls `while_waiting`, which must
-    /// not throw, now and then while it waits for the others at the end of a loop.
+    /// Each thread but the owner's calls `at_end` with its number before it ends. The owner calls `while_waiting`,
+    /// which must not throw, now and then while it waits for the others at the end of a loop.
     explicit Workers(
         int thread_count, std::function<void(int thread)> at_end = nullptr,
         std::function<void()> while_waiting = nullptr)
@@ -31,10 +31,10 @@ public:
     /// How many threads loops run on, the owner's included.
     int thread_count() const { return m_thread_count; }
 
-    /// Call work(begin, end, thread) for ranges of at most `grain` that make up [0, count), and return when all are done.
-    /// The owner takes ranges from the front and the others from the back, so that a thread mostly meets in one loop the
-    /// items that it had in the last, whose memory is near it; where they meet is left to chance. Throws the exception of
-    /// the first range that threw one.
+    /// Call work(begin, end, thread) for ranges of at most `grain` that make up [0, count), and return when all are
+    /// done. The owner takes ranges from the front and the others from the back, so that a thread mostly meets in one
+    /// loop the items that it had in the last, whose memory is near it; where they meet is left to chance. Throws the
+    /// exception of the first range that threw one.
     template <class Work>
     void for_each_range(int count, int grain, const Work& work) {
         if (m_thread_count > 1 && count > grain) {

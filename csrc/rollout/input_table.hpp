@@ -9,8 +9,8 @@
 #include "model/model.hpp"
 #include "model/state.hpp"
 
-/// The inputs of a rollout, one line each. All that hands them on loops over this table, here, in the bindings and in the
-/// Python layer: who adds a parameter adds a line, and the physics that reads the member it names.
+/// The inputs of a rollout, one line each. All that hands them on loops over this table, here, in the bindings and in
+/// the Python layer: who adds a parameter adds a line, and the physics that reads the member it names.
 namespace diffsim {
 
 enum class InputKind { state, control, parameter };
@@ -143,8 +143,8 @@ struct OneOf : Cases... {
 template <typename... Cases>
 OneOf(Cases...) -> OneOf<Cases...>;
 
-/// For every input of a kind, call that of the cases, (index in the table, member), that takes its member: there has to be
-/// one for every type of member.
+/// For every input of a kind, call that of the cases, (index in the table, member), that takes its member: there has to
+/// be one for every type of member.
 template <InputKind kind, typename... Cases>
 void for_each_input(const Cases&... cases) {
     const OneOf one_of{cases...};

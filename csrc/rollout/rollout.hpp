@@ -21,8 +21,8 @@ struct BatchedView {
     T* at(int time, int scene) const { return data + time * time_stride + scene * batch_stride; }
 };
 
-/// The inputs of a rollout, or gradients of the same shapes, in the order of the table. All of cloth is absent in scenes
-/// without.
+/// The inputs of a rollout, or gradients of the same shapes, in the order of the table. All of
+/// cloth is absent in scenes without.
 template <typename T>
 using RolloutArrays = std::array<BatchedView<T>, kInputCount>;
 using RolloutInputs = RolloutArrays<const double>;
@@ -77,8 +77,8 @@ struct RolloutInfo {
 
 /// Advance `shape.batch` scenes by `shape.steps`, on up to `thread_count` threads; the result does not depend on it.
 /// `signatures`, steps x batch, receives a hash of each step's active contacts. Throws std::invalid_argument on values
-/// that make no sense, naming the body, node or cloth, the field and the value, and Interrupted if `interrupt` was asked to
-/// stop, which is looked at before every step.
+/// that make no sense, naming the body, node or cloth, the field and the value, and Interrupted if `interrupt` was
+/// asked to stop, which is looked at before every step.
 RolloutInfo rollout(
     const std::shared_ptr<const Model>& model, const Options& options, const RolloutShape& shape,
     const RolloutInputs& inputs, const TrajectoryArrays<double>& trajectory, std::vector<std::uint64_t>& signatures,
@@ -98,8 +98,8 @@ struct GradientFault {
     std::vector<int> nodes;              ///< of cloths, indices into the node axis
 };
 
-/// What to say of a backward that gave numbers larger than `limit` or not finite: the last step in which that happened, of
-/// the first scene; nothing if upstream gradients are not finite to begin with. Runs the backward again.
+/// What to say of a backward that gave numbers larger than `limit` or not finite: the last step in which that happened,
+/// of the first scene; nothing if upstream gradients are not finite to begin with. Runs the backward again.
 std::optional<GradientFault> find_gradient_fault(
     const Tape& tape, const RolloutInputs& inputs, const TrajectoryArrays<const double>& upstream,
     const RolloutArrays<double>& wanted, double limit);

@@ -72,7 +72,8 @@ SceneState end_state(const StepRecord& record) {
     return end;
 }
 
-/// What the backward of a rollout's step has to compute: earlier steps need the state's gradient whether asked for or not.
+/// What the backward of a rollout's step has to compute: earlier steps need the state's
+/// gradient whether asked for or not.
 GradientNeeds step_needs(const RolloutArrays<double>& wanted, int time) {
     GradientNeeds needs{time > 0, false, false, false};
     for (std::size_t k = 0; k < kInputCount; ++k)
@@ -353,8 +354,8 @@ void rollout_backward(
 
 namespace {
 
-/// Call visit(model, options, parameters, control, record) for the last step of a scene; of one in two parts for that which
-/// is about velocities, and so about forces.
+/// Call visit(model, options, parameters, control, record) for the last step of a scene; of one in two parts for that
+/// which is about velocities, and so about forces.
 template <class Visit>
 auto with_last_step(const Tape& tape, const RolloutInputs& inputs, int scene, const Visit& visit) {
     const Model& model = *tape.model;

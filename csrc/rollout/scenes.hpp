@@ -11,9 +11,9 @@ namespace diffsim {
 /// From how many bodies and nodes on threads are better used inside a scene than left idle for want of scenes.
 inline constexpr int kBigScene = 256;
 
-/// Call work(scene, workspace) for every scene. Threads divide the scenes among themselves where there is one for each of
-/// them, else, where scenes are big, the bodies and zones of one scene after the other. The first exception, by scene, is
-/// thrown on. `interrupt`, if given, is asked while the calling thread has nothing else to do.
+/// Call work(scene, workspace) for every scene. Threads divide the scenes among themselves where there is one for each
+/// of them, else, where scenes are big, the bodies and zones of one scene after the other. The first exception, by
+/// scene, is thrown on. `interrupt`, if given, is asked while the calling thread has nothing else to do.
 template <typename Work>
 void for_each_scene(const Model& model, int batch, int thread_count, Interrupt* interrupt, const Work& work) {
     const bool one_by_one =

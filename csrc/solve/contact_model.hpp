@@ -53,15 +53,17 @@ struct ModelSolution {
     int newton_steps = 0;  ///< factorizations
 };
 
-/// Minimise the model with its rows at this share of their stiffness, by Newton's method on the piecewise quadratic with
-/// exact line search: it ends with the first full step after which no row has changed sides. `p` holds the start, which
-/// pinned nodes keep, and receives the minimiser; the rows receive their forces. Where a step comes out shorter than
-/// `least_step` it is given up: too many rows change sides at once. Scratch: `system`, whose pattern is that of model.smooth.
+/// Minimise the model with its rows at this share of their stiffness, by Newton's method on the piecewise quadratic
+/// with exact line search: it ends with the first full step after which no row has changed sides. `p` holds the
+/// start, which pinned nodes keep, and receives the minimiser; the rows receive their forces. Where a step comes
+/// out shorter than `least_step` it is given up: too many rows change sides at once. Scratch: `system`, whose
+/// pattern is that of model.smooth.
 ModelSolution minimise(
     ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& workspace,
     Coordinates& p);
 
-/// Add what the rows of two bodies do to them together, `row` one of these, to the gradient and, unless it is null, the matrix.
+/// Add what the rows of two bodies do to them together, `row` one of these, to the gradient and,
+/// unless it is null, the matrix.
 void add_run(
     const ContactRow& row, const Vector<9>& force, const HalfSymmetric<9>& stiffness, Coordinates& gradient,
     BlockSystem* system);

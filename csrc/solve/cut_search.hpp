@@ -7,8 +7,8 @@
 /// How much negative curvature a matrix of a zone loses before it is factorized.
 namespace diffsim {
 
-/// How much of the negative curvature of cloth to cut off: no more than needed, since it is what a sheet follows when it
-/// buckles. The share that it takes is searched from one matrix to the next.
+/// How much of the negative curvature of cloth to cut off: no more than needed, since it is what a sheet follows when
+/// it buckles. The share that it takes is searched from one matrix to the next.
 class CutSearch {
 public:
     CutShare share() const { return m_share; }

@@ -110,9 +110,10 @@ private:
         return largest > 0.0 ? change / largest : 0.0;
     }
 
-    /// Along M dp/dτ = -F(p), F what is left of the balance, by implicit Euler steps in a pseudo-time that double where Newton's
-    /// method finds their ends. Where bounds that follow the forces feed themselves, Newton's own steps go to and fro between
-    /// contacts that stick and slip, and rounds of bounds that stand still lead away, while this goes on until something holds.
+    /// Along M dp/dτ = -F(p), F what is left of the balance, by implicit Euler steps in a pseudo-time that double
+    /// where Newton's method finds their ends. Where bounds that follow the forces feed themselves, Newton's own steps
+    /// go to and fro between contacts that stick and slip, and rounds of bounds that stand still lead away, while this
+    /// goes on until something holds.
     void flow() {
         double duration = 1.0;  // in which inertia alone takes half of F away
         for (double left = find_left(); left > m_goal.tolerance; left = find_left()) {
@@ -320,8 +321,8 @@ private:
         return false;
     }
 
-    /// From the forces of the model before, linearly and every contact as it was: forces are carried from model to model, not
-    /// places, at which other springs have other forces and everything that sticks seems to slip.
+    /// From the forces of the model before, linearly and every contact as it was: forces are carried from model to
+    /// model, not places, at which other springs have other forces and everything that sticks seems to slip.
     bool keep_states() {
         m_w.pushes.resize(m_rows.size());
         bool any = false;
@@ -378,8 +379,8 @@ private:
         m_second = dot(m_w.step, m_w.smooth_step);
     }
 
-    /// What is left of the balance along the step, with bounds that stay as they are: without turns the slope of a convex
-    /// energy.
+    /// What is left of the balance along the step, with bounds that stay as they are: without turns
+    /// the slope of a convex energy.
     double slope(double t, const std::vector<double>& bound) const {
         double sum = m_first + t * m_second;
         for (std::size_t r = 0; r < m_rows.size(); ++r) {

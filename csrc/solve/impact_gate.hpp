@@ -7,9 +7,9 @@
 /// Iterates are free of penetration one after the other, and may all the same lead around an obstacle that is small
 /// against the motion of one step; behind it the energy is as low as if it were not there. To the user that is passing
 /// through. So the first impact of two bodies on the straight way to their targets is remembered: their points that met
-/// there may pass each other along the normal by sliding or rolling off, but not by more than a part of the smaller body.
-/// Where bodies spin, they may be past each other at the start: it counts from there.
-/// It does not hold for the next step, by which fast bodies may have come around each other.
+/// there may pass each other along the normal by sliding or rolling off, but not by more than a part of the smaller
+/// body. Where bodies spin, they may be past each other at the start: it counts from there. It does not hold for the
+/// next step, by which fast bodies may have come around each other.
 namespace diffsim {
 
 struct ImpactGate {

@@ -26,7 +26,7 @@ bool before(const Contact& c, const Contact& d) {
 ModelDirection::ModelDirection(const Zone& zone, ZonePath& path, ZonePoint& point, BlockSystem& system)
     : m_zone(zone), m_path(path), m_point(point), m_system(system) {}
 
-// --- forces, across lists of contacts ---------------------------------------------------------------------------------
+// --- forces, across lists of contacts --------------------------------------------------------------------------------
 
 void ModelDirection::recall_forces() {
     if (m_list == m_path.list_number()) return;
@@ -84,7 +84,7 @@ void ModelDirection::sort_kept() {
     std::sort(m_kept.begin(), m_kept.end(), [](const Kept& a, const Kept& b) { return before(a.contact, b.contact); });
 }
 
-// --- the model --------------------------------------------------------------------------------------------------------
+// --- the model -------------------------------------------------------------------------------------------------------
 
 /// Near are contacts that push, did in the last model, or may come to on the way to where nothing holds the bodies.
 void ModelDirection::list_near() {
@@ -203,8 +203,8 @@ void ModelDirection::make_start_row(const NearContact& near) {
     add_friction_row(near, near.geometry);
 }
 
-/// Cold, Newton's method crawls from one set of pushing rows to the next: from soft rows to stiff ones it gets there in a
-/// few steps each.
+/// Cold, Newton's method crawls from one set of pushing rows to the next: from soft rows to stiff ones it
+/// gets there in a few steps each.
 bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
     if (!m_model.friction.empty()) {
         const ModelSolution balanced = balance(m_model, m_zone, m_goal, m_system, m_balance, p);
@@ -243,8 +243,8 @@ bool ModelDirection::add_missed(const Coordinates& y_end) {
     return true;
 }
 
-/// Fast bodies that meet would whirl around each other, where rows mean nothing: heavier, they turn less. True if some got
-/// heavier.
+/// Fast bodies that meet would whirl around each other, where rows mean nothing: heavier, they turn
+/// less. True if some got heavier.
 bool ModelDirection::turns_too_far(const Coordinates& p) {
     bool too_far = false;
     for (std::size_t i = 0; i < p.bodies.size(); ++i) {

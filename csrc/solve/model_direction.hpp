@@ -7,11 +7,11 @@
 /// The direction of a zone far from its solution.
 namespace diffsim {
 
-/// The direction of a zone far from its solution: the minimiser of one convex model of all near contacts, linearised again
-/// where it ends for as long as CCD does not let it go all the way. See docs/solver.md.
+/// The direction of a zone far from its solution: the minimiser of one convex model of all near contacts, linearised
+/// again where it ends for as long as CCD does not let it go all the way. See docs/solver.md.
 ///
-/// What it learns from model to model within a step: the contacts' forces, which give the next model its curvature and its first guess of
-/// who pushes, and which bodies need damping.
+/// What it learns from model to model within a step: the contacts' forces, which give the next model its curvature and
+/// its first guess of who pushes, and which bodies need damping.
 class ModelDirection {
 public:
     /// All of them are used for as long as this lives.
@@ -35,7 +35,8 @@ public:
         bool found = false;    ///< false where rounding spoils the model's matrix
         double free = 0.0;     ///< how much of the way to y_end is free for all that is listed
         int newton_steps = 0;  ///< factorizations
-        /// Driven bodies leave no room even where the rows are those of where the way ends: something is squeezed there.
+        /// Driven bodies leave no room even where the rows are those of where the way
+        /// ends: something is squeezed there.
         bool squeezes = false;
     };
     /// Of models with friction.
@@ -53,9 +54,9 @@ public:
         return m_friction;
     }
 
-    /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts is
-    /// made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then, none is found:
-    /// a Newton step does as well.
+    /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts
+    /// is made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then,
+    /// none is found: a Newton step does as well.
     Way find(const Coordinates& gradient, bool driven, Coordinates& y_end);
 
     /// The energy at the trial is higher, by so much: damp the bodies whose contacts ask for it in the next model.

@@ -6,7 +6,8 @@
 #include "zone/contacts.hpp"
 #include "zone/sides_of.hpp"
 
-/// The way that a model leads: found, followed to where it ends, linearised there, and shortened where something stops it.
+/// The way that a model leads: found, followed to where it ends, linearised there, and
+/// shortened where something stops it.
 namespace diffsim {
 namespace {
 
@@ -17,8 +18,8 @@ constexpr int kMaxShortenings = 6;  // of the way of bodies that something still
 
 }  // namespace
 
-/// Rows are straight and bodies turn: make them again where the way ends. A pair that was hit on the way and whose normal has
-/// turned over is on the other side of itself.
+/// Rows are straight and bodies turn: make them again where the way ends. A pair that was hit on the way and whose
+/// normal has turned over is on the other side of itself.
 void ModelDirection::linearise_at(const Coordinates& y_end, const std::vector<Impact>& impacts) {
     const std::size_t known = m_near.size();
     std::size_t near_index = 0;
@@ -190,8 +191,8 @@ bool ModelDirection::find_minimiser(Coordinates& p, int& newton_steps, Coordinat
     return true;
 }
 
-/// Go the way p as far as there is room: linearised where it ends, and shortened where that is not enough. y_end: of the
-/// way with most room.
+/// Go the way p as far as there is room: linearised where it ends, and shortened where that is not enough.
+/// y_end: of the way with most room.
 void ModelDirection::follow(Coordinates& p, bool driven, Way& way, Coordinates& y_end) {
     std::vector<Impact> impacts;
     way.free = allowed_step(m_zone, m_point, y_end, &impacts);

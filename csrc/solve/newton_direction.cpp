@@ -57,9 +57,10 @@ bool NewtonDirection::factorize_bodies(
     return m_has_factor;
 }
 
-/// With A the exact Hessian and B the one at hand, A without its negative part pair by pair: the eigenvectors of B⁻¹ (B - A)
-/// with values above 1 are directions of negative curvature, and iterating v -> v - B⁻¹ A v lets these grow. They begin all
-/// together, in a direction that nothing but the bodies' ids decides, so that what is symmetric leaves as one.
+/// With A the exact Hessian and B the one at hand, A without its negative part pair by pair: the eigenvectors
+/// of B⁻¹ (B - A) with values above 1 are directions of negative curvature, and iterating v -> v - B⁻¹ A v
+/// lets these grow. They begin all together, in a direction that nothing but the bodies' ids decides, so that
+/// what is symmetric leaves as one.
 bool NewtonDirection::off_saddle(
     const Zone& zone, const ZoneDerivatives& derivatives, const BlockSystem& system, Coordinates& step) {
     const std::size_t count = static_cast<std::size_t>(zone.dynamic_count);

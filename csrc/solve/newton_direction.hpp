@@ -11,16 +11,16 @@ namespace diffsim {
 /// Newton steps of a zone, one after the other, and the factor that the last of them came from.
 class NewtonDirection {
 public:
-    /// Derivatives at the point and the Newton step from there: by the exact Hessian where that is positive definite, else
-    /// without some of its negative curvature. False if rounding spoils even that.
+    /// Derivatives at the point and the Newton step from there: by the exact Hessian where that is positive definite,
+    /// else without some of its negative curvature. False if rounding spoils even that.
     bool compute(
         const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem& system, Coordinates& step);
     /// The step that the last factor, still in the system, gives for a new gradient.
     bool repeat(
         const Zone& zone, const ZoneDerivatives& derivatives, const BlockSystem& system, Coordinates& step) const;
 
-    /// After compute(), where bodies' exact Hessian was not positive definite: a direction of negative curvature that does not
-    /// lead up. False if none was found.
+    /// After compute(), where bodies' exact Hessian was not positive definite: a direction of negative curvature that
+    /// does not lead up. False if none was found.
     bool off_saddle(const Zone& zone, const ZoneDerivatives& derivatives, const BlockSystem& system, Coordinates& step);
 
     bool has_factor() const { return m_has_factor; }

@@ -15,9 +15,9 @@ struct Separation {
     double lack = 0.0;        ///< how much of the depth is missing [1]
 };
 
-/// Move dynamic bodies and cloth that touch, or are nearer than their rest distance, apart to it, by a smallest motion in the
-/// mass metric. Overlaps of rounding size are resolved; anything deeper is a mistake that the scene's validation finds.
-/// The zone's bodies are its dynamic bodies at their poses, its nodes those of all cloths. Pinned nodes stay.
+/// Move dynamic bodies and cloth that touch, or are nearer than their rest distance, apart to it, by a smallest motion
+/// in the mass metric. Overlaps of rounding size are resolved; anything deeper is a mistake that the scene's validation
+/// finds. The zone's bodies are its dynamic bodies at their poses, its nodes those of all cloths. Pinned nodes stay.
 Separation separate(Zone zone, const PassiveBodies& passive);
 
 }  // namespace diffsim

@@ -159,7 +159,8 @@ private:
         m_best = m_work.point.y;
     }
 
-    /// Where least was left of the balance: models that find none may have squeezed things from which no later step recovers.
+    /// Where least was left of the balance: models that find none may have squeezed things from
+    /// which no later step recovers.
     void fail(StepStatus status) {
         m_search.fail(status);
         if (m_least == kInfinity) return;

@@ -8,12 +8,12 @@
 /// Ways of a zone, and the contacts that are listed for them.
 namespace diffsim {
 
-/// Where a zone may go from its current point: the list of its contacts is made complete for the ways that are asked about,
-/// and these end before impacts and gates. Trials are points on such ways.
+/// Where a zone may go from its current point: the list of its contacts is made complete for the ways that are asked
+/// about, and these end before impacts and gates. Trials are points on such ways.
 class ZonePath {
 public:
-    /// The zone begins without contacts. All of them are used, and the zone's contacts, `point`, `trial` and `coverage` changed, for as long as this lives. `system` gets the
-    /// pattern of the contacts.
+    /// The zone begins without contacts. All of them are used, and the zone's contacts, `point`, `trial` and `coverage`
+    /// changed, for as long as this lives. `system` gets the pattern of the contacts.
     ZonePath(
         Zone& zone, const PassiveBodies& passive, ZonePoint& point, ZonePoint& trial, ContactCoverage& coverage,
         BlockSystem& system);
@@ -55,7 +55,8 @@ public:
     double clear_step(const Coordinates& y_end, Clearance clearance = Clearance::floor);
     /// Shorten a step until the chords to its end are clear.
     double arc_step(const Coordinates& y_end, double step);
-    /// The allowed step to y_end, with the list of contacts complete for it. `known`: how much is free for those listed.
+    /// The allowed step to y_end, with the list of contacts complete for it. `known`: how
+    /// much is free for those listed.
     double covered_step(Coordinates& y_end, double known = 0.0);
 
 private:

@@ -33,8 +33,8 @@ public:
     /// Whether all that is driven has reached its target.
     bool drives_done() const;
     /// Go along with driven bodies as far as allowed, whatever the energy: they must reach their targets.
-    /// Where there is no room at all, what is in the way may make some in steps of its own. `stalls` counts the steps that
-    /// get nowhere.
+    /// Where there is no room at all, what is in the way may make some in steps of its own. `stalls`
+    /// counts the steps that get nowhere.
     enum class DriveProgress { moved, waits, blocked };
     DriveProgress advance_drives(double step, int& stalls);
 

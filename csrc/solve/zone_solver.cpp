@@ -76,8 +76,8 @@ private:
         m_model->start_from(m_work.point);
     }
 
-    /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that reach
-    /// to their targets would be full of neighbours that they never meet.
+    /// The targets, but for bodies that something seems to hold: they hardly moved in the last step, and lists that
+    /// reach to their targets would be full of neighbours that they never meet.
     void set_to_expected_ends(Coordinates& y_end) const {
         m_path.set_to_targets(y_end);
         for (std::size_t i = 0; i < y_end.bodies.size(); ++i) {
@@ -119,8 +119,8 @@ private:
             if (!m_zone.nodes[i].pinned) m_work.y_end.nodes[i] = m_zone.nodes[i].last_motion;
         if (largest_move() < kEpsilon * m_path.position()) return;
         m_path.ensure_covered(m_work.y_end);
-        // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0 has, and
-        // descend from there to minimisers that no motion of that energy can reach.
+        // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0
+        // has, and descend from there to minimisers that no motion of that energy can reach.
         const double step = m_path.clear_step(m_work.y_end, Clearance::landing);
         if (step > 0.0 && m_work.trial.energy <= m_work.point.energy) accept_trial();
     }
@@ -177,8 +177,9 @@ private:
     }
 
     /// Whether the gradient alone says that a Newton step reached the minimum, or came so near that further steps with
-    /// the factor at hand reach it. If so, takes the last of them past the tolerance: another factor would only show the
-    /// same. The gradient is worth its price where factors are dear, with cloth, and where the line search has it anyway.
+    /// the factor at hand reach it. If so, takes the last of them past the tolerance: another factor would
+    /// only show the same. The gradient is worth its price where factors are dear, with cloth, and where
+    /// the line search has it anyway.
     bool converge_with_factor() {
         const bool with_cloth = !m_zone.nodes.empty() && m_zone.elastic;
         if (!m_newton.has_factor() || !(with_cloth || (m_newton.is_exact() && m_trial_is_differentiated))) return false;
@@ -281,8 +282,9 @@ private:
         }
     }
 
-    /// Near a point of balance that is a saddle of the energy, where descent hardly moves: go off it along negative curvature,
-    /// by the largest part of the contacts' range that lowers the energy. Once is enough: from there descent goes on.
+    /// Near a point of balance that is a saddle of the energy, where descent hardly moves: go off it along
+    /// negative curvature, by the largest part of the contacts' range that lowers the energy. Once is
+    /// enough: from there descent goes on.
     bool leave_saddle(const Accuracy& now) {
         if (m_left_saddle || !m_zone.nodes.empty() || m_newton.is_exact() || now.residual > kNearSolution) return false;
         m_left_saddle = true;
@@ -354,7 +356,8 @@ private:
         evaluate(m_zone, m_work.trial, &m_work.point);
         const double change = m_work.trial.energy - m_work.point.energy, noise = current_noise();
         if (change > noise) {
-            // What rises with bodies is the contacts' energy, where rows are not true to them. Cloth buckles: a shorter step will do.
+            // What rises with bodies is the contacts' energy, where rows are not true to them. Cloth
+            // buckles: a shorter step will do.
             if (m_zone.nodes.empty() || !line_search(m_path.arc_step(m_work.y_end, 0.5 * step))) {
                 m_model->damp(m_work.trial, change);
                 return ModelStep::taken;
@@ -366,8 +369,8 @@ private:
         return ModelStep::taken;
     }
 
-    /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel. False if there
-    /// is nothing to gain.
+    /// One more full step, also past the tolerance: it takes the solution to rounding, which gradients feel.
+    /// False if there is nothing to gain.
     bool polish() {
         if (m_work.derivatives.largest_force == 0.0 && m_result.residual == 0.0) return false;
         if (!m_path.covers(m_work.y_end)) return false;

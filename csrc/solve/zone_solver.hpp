@@ -26,8 +26,8 @@ enum class StepStatus {
 struct ZoneOptions {
     double tolerance = 1e-10;  ///< on the residual
     int max_iterations = 200;
-    /// Take this many full Newton steps, whether or not they lower the energy: for a zone without bodies and contacts, whose
-    /// pinned nodes are at their targets from the first. Once from rest is Eq. 3 of [Qiao et al. 2020].
+    /// Take this many full Newton steps, whether or not they lower the energy: for a zone without bodies and contacts,
+    /// whose pinned nodes are at their targets from the first. Once from rest is Eq. 3 of [Qiao et al. 2020].
     std::optional<int> full_steps;
     Interrupt* interrupt = nullptr;  ///< may be asked between iterations: whoever waits for a long zone may have gone
 };
@@ -51,10 +51,10 @@ struct ZoneWorkspace {
     std::vector<ContactFriction> friction;  ///< one per active contact of the point; empty where a zone has none
 };
 
-/// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts after
-/// the other, the last steps by Newton's method, as docs/solver.md describes. On return workspace.point is the last iterate: the
-/// minimiser, or if the status says so the last penetration-free point before failure. `swept`, one box per dynamic
-/// body, receives the space swept by the bodies' vertices in the zone frame.
+/// Minimise the zone's energy from y = 0, every iterate penetration-free: by one convex model of all near contacts
+/// after the other, the last steps by Newton's method, as docs/solver.md describes. On return workspace.point is the
+/// last iterate: the minimiser, or if the status says so the last penetration-free point before failure. `swept`, one
+/// box per dynamic body, receives the space swept by the bodies' vertices in the zone frame.
 ZoneResult solve_zone(
     Zone& zone, const PassiveBodies& passive, const ZoneOptions& options, ZoneWorkspace& workspace,
     std::vector<Box>& swept);

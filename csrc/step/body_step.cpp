@@ -11,14 +11,15 @@
 namespace diffsim {
 namespace {
 
-/// Velocity of a body that nothing touches: v0 + t (g + f / m), at the end of the step or, where it is for places, in the middle.
+/// Velocity of a body that nothing touches: v0 + t (g + f / m), at the end of the step or, where it
+/// is for places, in the middle.
 Vec3 free_velocity(const StepSetting& setting, int id, const BodyState& state, const BodyControl& control) {
     return state.velocity +
            setting.acceleration_time() * (setting.parameters.gravity + control.force / setting.parameters.mass[id]);
 }
 
-/// How a body turns that nothing touches. Where the step is for velocities it turns by dt w1, if that is an angle at all, so
-/// that what contact leaves of the turn is the velocity it leaves.
+/// How a body turns that nothing touches. Where the step is for velocities it turns by dt w1, if that is an angle at
+/// all, so that what contact leaves of the turn is the velocity it leaves.
 FreeRotation free_turn(const StepSetting& setting, int id, const BodyState& state, const BodyControl& control) {
     const auto solve = setting.part == StepPart::whole ? free_rotation : conserving_rotation;
     FreeRotation result = solve(
@@ -134,7 +135,7 @@ bool body_overflows(const BodyState& state, const Vec6& motion, double dt) {
     return !(motion.squaredNorm() <= kLargestSquare * dt_sq && state.position.squaredNorm() <= kLargestSquare);
 }
 
-// --- backward ---------------------------------------------------------------------------------------------------------
+// --- backward --------------------------------------------------------------------------------------------------------
 
 Vec6 body_upstream(const BodyStateGradient& end, const Vec6& y, double dt) {
     Vec6 v;

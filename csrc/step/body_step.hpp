@@ -7,9 +7,10 @@
 #include "step/step_setting.hpp"
 #include "zone/zone.hpp"
 
-/// The time scheme of one rigid body: how its step begins, how it ends, and the backward of both. Implicit Euler: momentum form
-/// for turns (dynamics/free_motion.hpp), the velocity at the end of the step for shifts. Trapezoidal, by the part of the step:
-/// velocities as implicit Euler has them but for dynamics/conserving_rotation.hpp, places by mean velocities.
+/// The time scheme of one rigid body: how its step begins, how it ends, and the backward of both. Implicit Euler:
+/// momentum form for turns (dynamics/free_motion.hpp), the velocity at the end of the step for shifts.
+/// Trapezoidal, by the part of the step: velocities as implicit Euler has them but for
+/// dynamics/conserving_rotation.hpp, places by mean velocities.
 namespace diffsim {
 
 /// A body at the start of a step.
@@ -26,8 +27,8 @@ ZoneBody moving_body(
     const StepSetting& setting, int id, const BodyState& state, const BodyControl& control,
     const FreeRotation& rotation);
 
-/// The state after the motion `y`. `start`: of this step. `as_told`: a driven body was not held up, and has the velocity it was
-/// given.
+/// The state after the motion `y`. `start`: of this step. `as_told`: a driven body was not held up, and
+/// has the velocity it was given.
 BodyState end_body(
     const StepSetting& setting, const BodyStart& start, int id, const BodyState& state, const BodyControl& control,
     const Vec6& y, bool as_told);
@@ -35,7 +36,8 @@ BodyState end_body(
 /// An orientation after a turn.
 Vec4 turned(const Vec4& orientation, const Vec3& turn);
 
-/// Space for a dynamic body from where it is to where it went in the last step or would go: world frame, margins included.
+/// Space for a dynamic body from where it is to where it went in the last step or would go:
+/// world frame, margins included.
 Box space_of_body(const Model& model, const ZoneBody& body);
 /// For a body that moves as told, by `motion`.
 Box space_of_driven_body(const Model& model, int id, const Pose& start, const Vec6& motion);
@@ -56,8 +58,8 @@ struct BodyAdjoint {
     const Vec6& drive;       ///< of a driven one, through slips: along its motion, its pose at the end held
 };
 
-/// Carry the gradient at the end of a step back to its start: `gradient` is overwritten, the others are added to. `state`,
-/// `rotation`: of the start.
+/// Carry the gradient at the end of a step back to its start: `gradient` is overwritten, the others are added to.
+/// `state`, `rotation`: of the start.
 void body_backward(
     const StepSetting& setting, int id, const BodyState& state, const BodyControl& control,
     const FreeRotation& rotation, const Vec6& y, const BodyAdjoint& adjoint, const GradientNeeds& needs,

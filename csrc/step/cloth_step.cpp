@@ -82,7 +82,7 @@ bool cloth_overflows(const StepSetting& setting, int id, const SceneState& state
     return false;
 }
 
-// --- backward ---------------------------------------------------------------------------------------------------------
+// --- backward --------------------------------------------------------------------------------------------------------
 
 Vec3 node_upstream(const SceneStateGradient& end, int node, double dt) {
     return end.node_position[node] + end.node_velocity[node] / dt;
@@ -111,7 +111,8 @@ void ClothBackward::finish(const Zone& zone, const ZoneAdjoint& adjoint) {
     }
 }
 
-/// The zone of one cloth's elastic pass, at its solution, and the gradient there: of its motion as the contact pass's target.
+/// The zone of one cloth's elastic pass, at its solution, and the gradient there: of its motion
+/// as the contact pass's target.
 void ClothBackward::start_elastic_pass(
     const Zone& contact_zone, const ZoneAdjoint& contact, const ZoneCloth& cloth,
     const std::vector<Vec3>& elastic_shift, Zone& zone, ZonePoint& point, Coordinates& upstream) {

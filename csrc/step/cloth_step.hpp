@@ -12,8 +12,8 @@ namespace diffsim {
 /// Append a cloth at the start of a step to a zone, whose origin and dt are set.
 void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters);
 
-/// The cloth's part of the state after the motion `shift`, one per node of the scene. `as_told`: nothing was held up, and pinned
-/// nodes have the velocity they were given.
+/// The cloth's part of the state after the motion `shift`, one per node of the scene. `as_told`: nothing was held up,
+/// and pinned nodes have the velocity they were given.
 void end_cloth(
     const StepSetting& setting, int id, const SceneControl& control, const std::vector<Vec3>& shift, bool as_told,
     SceneState& state);
@@ -21,7 +21,8 @@ void end_cloth(
 /// Space for a cloth from where it is to where its nodes would go: world frame, margins included.
 Box space_of_cloth(const StepSetting& setting, int id, const SceneState& state, const SceneControl& control);
 
-/// Whether numbers are too small to hold a cloth, at the start of the step, where `state` moves as it is driven, or at its end.
+/// Whether numbers are too small to hold a cloth, at the start of the step, where `state` moves
+/// as it is driven, or at its end.
 bool cloth_overflows(const StepSetting& setting, int id, const SceneState& state, const SceneControl& control);
 
 // --- backward
@@ -32,7 +33,8 @@ Vec3 node_upstream(const SceneStateGradient& end, int node, double dt);
 /// Carries the gradient at the end of a step back to its start, cloth by cloth.
 class ClothBackward {
 public:
-    /// `start`, `y`: state at the start of the step, and its motion. `gradient` is overwritten, the last two are added to.
+    /// `start`, `y`: state at the start of the step, and its motion. `gradient` is
+    /// overwritten, the last two are added to.
     ClothBackward(
         const StepSetting& setting, const SceneState& start, const SceneControl& control, const Coordinates& y,
         SceneStateGradient& gradient, SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient)
@@ -47,8 +49,8 @@ public:
     /// The cloths of a zone that was solved at once.
     void finish(const Zone& zone, const ZoneAdjoint& adjoint);
 
-    /// Split coupling: carry the contact pass's gradient with respect to its targets on through the elastic pass, in which nodes
-    /// moved by `elastic_shift`.
+    /// Split coupling: carry the contact pass's gradient with respect to its targets on through the elastic pass, in
+    /// which nodes moved by `elastic_shift`.
     void finish_split(
         const Zone& contact_zone, const ZoneAdjoint& contact, const std::vector<Vec3>& elastic_shift, AdjointMode mode,
         const GradientNeeds& needs, AdjointWorkspace& workspace);

@@ -25,8 +25,8 @@ struct MovedBody {
     SweptSurface surface() const { return {{&mesh, &begin, nullptr}, {&mesh, &end, nullptr}}; }
 };
 
-/// How much of the way is free for a driven body and one that stands, at most `part`. Features that are nearer than any two
-/// objects keep to each other are left alone.
+/// How much of the way is free for a driven body and one that stands, at most `part`. Features that are nearer than any
+/// two objects keep to each other are left alone.
 double free_part(
     const Model& model, int driven, const MovedBody& moved, int other, const MovedBody& obstacle, double part) {
     const ContactRange range = contact_range(model.margin_sum(driven, other), model.pair_thickness(driven, other));

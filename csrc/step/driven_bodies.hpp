@@ -10,8 +10,8 @@ struct DriveStop {
     int obstacle = kNobody;  ///< index into Model::bodies
 };
 
-/// Whether a driven body, one of `passive`, comes to a static one on its way: neither gives way. Bodies that cross when the
-/// step starts are left alone. The chord of the motion is looked at, as by all of CCD.
+/// Whether a driven body, one of `passive`, comes to a static one on its way: neither gives way. Bodies that cross when
+/// the step starts are left alone. The chord of the motion is looked at, as by all of CCD.
 DriveStop find_static_obstacle(const Model& model, const PassiveBodies& passive, const PassiveBody& driven);
 
 }  // namespace diffsim

@@ -11,8 +11,8 @@ namespace {
 
 constexpr std::size_t kMaxNamed = 8;  // objects of a zone that is not solved: a reader looks at no more
 
-/// Squared length of the force that is left on an object, in the metric of the inverse masses: |L⁻¹ g|², M = L Lᵀ. That of
-/// a cloth is its worst node's.
+/// Squared length of the force that is left on an object, in the metric of the inverse masses: |L⁻¹ g|², M = L Lᵀ. That
+/// of a cloth is its worst node's.
 std::vector<std::pair<double, int>> unbalanced_forces(const Zone& zone, const ZonePoint& point) {
     ZoneDerivatives derivatives;
     differentiate(zone, point, Curvature::none, derivatives, nullptr);

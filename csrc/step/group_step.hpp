@@ -43,8 +43,8 @@ public:
         std::vector<Box>& swept;  ///< receives the space that they went through: world frame, margins included
     };
 
-    /// Solve a group whose objects `members` lists. Contacts, blocked drives and who failed are added to the thread's results.
-    /// Throws PenetratingStart.
+    /// Solve a group whose objects `members` lists. Contacts, blocked drives and who failed are added to the thread's
+    /// results. Throws PenetratingStart.
     GroupOutcome solve(
         const ObjectGroup& group, const std::vector<int>& members, const Objects& objects, ThreadMemory& memory) const;
 

@@ -15,8 +15,8 @@ struct ObjectGroup {
     int first, end;
 };
 
-/// Which of the objects that yield in a step may meet: each has a space reserved for its motion, and objects whose spaces
-/// overlap are in one group, which the smallest of them stands for.
+/// Which of the objects that yield in a step may meet: each has a space reserved for its motion, and objects whose
+/// spaces overlap are in one group, which the smallest of them stands for.
 class ObjectGroups {
 public:
     /// Each of the movers, ascending, in a group of its own, with no space yet.
@@ -29,8 +29,8 @@ public:
     void unite_all();
     void unite_overlapping();
 
-    /// Objects that were pushed out of their space may have met others: adds what they swept (of all objects) to it, and
-    /// joins groups that overlap now. The joined pairs, by their roots before.
+    /// Objects that were pushed out of their space may have met others: adds what they swept (of all objects) to it,
+    /// and joins groups that overlap now. The joined pairs, by their roots before.
     std::vector<std::pair<int, int>> include_swept(const std::vector<Box>& swept);
 
     /// All groups by their roots, ascending. Valid until groups are united again.

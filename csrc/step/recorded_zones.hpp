@@ -15,8 +15,8 @@ public:
 
     int count() const { return static_cast<int>(m_record.zones.body_end.size()); }
 
-    /// memory.zone becomes a zone with its active contacts only, memory.workspace.point the zone at the end of the step.
-    /// With split coupling the zone is that of the contact pass. `local` is memory that calls reuse.
+    /// memory.zone becomes a zone with its active contacts only, memory.workspace.point the zone at the end of the
+    /// step. With split coupling the zone is that of the contact pass. `local` is memory that calls reuse.
     void rebuild(int index, ZoneMemory& memory, std::vector<int>& local) const;
 
 private:

@@ -307,8 +307,8 @@ private:
                !meets_passive(group.root, near);
     }
 
-    /// Groups whose objects were pushed to where they may have met others are to be solved again, together. False if there
-    /// are none.
+    /// Groups whose objects were pushed to where they may have met others are to be solved again,
+    /// together. False if there are none.
     bool merge_met_groups() {
         const auto joined = m_scratch.groups.include_swept(m_scratch.swept);
         for (const auto& [i, j] : joined) {

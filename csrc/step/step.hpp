@@ -18,12 +18,13 @@
 
 /// One time step and its backward: the only place that knows the whole order.
 ///
-/// With implicit Euler a step is one solve: y is the minimiser of [zone/zone.hpp] for targets ŷ = dt v̂, v̂ the velocity at the
-/// end of free motion, and the new velocities are y / dt. The trapezoidal scheme has two solves from the same start:
-///  * velocities: that of implicit Euler, whose y / dt are the new velocities, so that contact is inelastic, what rests has
-///    none, and momentum is kept among bodies in contact;
-///  * places: targets ŷ = dt (v0 + v̂) / 2, bodies of double weight. What contact does to places is then dt² f / (2 m), as
-///    what gravity does is dt² g / 2; forces, and compressions at rest, are those of the other solve.
+/// With implicit Euler a step is one solve: y is the minimiser of [zone/zone.hpp] for targets ŷ = dt v̂, v̂
+/// the velocity at the end of free motion, and the new velocities are y / dt. The trapezoidal scheme has
+/// two solves from the same start:
+///  * velocities: that of implicit Euler, whose y / dt are the new velocities, so that contact is inelastic, what rests
+///    has none, and momentum is kept among bodies in contact;
+///  * places: targets ŷ = dt (v0 + v̂) / 2, bodies of double weight. What contact does to places is then dt² f / (2 m),
+///    as what gravity does is dt² g / 2; forces, and compressions at rest, are those of the other solve.
 /// Cloth has the targets of implicit Euler in both.
 namespace diffsim {
 
@@ -88,8 +89,9 @@ public:
     StepWorkspace& operator=(const StepWorkspace&) = delete;
 
     /// A thread's own memory. The thread itself must be the first to ask for it: it is made there, and given back there
-    /// when the thread ends. An allocator hands out what a thread gives back to that thread again, so memory that another
-    /// one has given back lies among what that one writes to, and two threads wait for the same cache lines all the time.
+    /// when the thread ends. An allocator hands out what a thread gives back to that thread again, so
+    /// memory that another one has given back lies among what that one writes to, and two threads wait for
+    /// the same cache lines all the time.
     ThreadMemory& memory(int thread = 0);
     /// Call visit(memory) for the threads that have some.
     template <class Visit>
@@ -115,12 +117,14 @@ public:
 inline constexpr int kBodiesARange = 128;
 
 /// Advance by options.dt. `record`, if given, receives what step_backward needs; it does not change the result.
-/// Throws PenetratingStart if objects penetrate at the start. Where motions are too large for numbers to hold, all is held.
+/// Throws PenetratingStart if objects penetrate at the start. Where motions are too large for
+/// numbers to hold, all is held.
 SceneState step(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record);
 
-/// What takes the place of a step that cannot be taken because of these objects: the state, unchanged and not converged.
+/// What takes the place of a step that cannot be taken because of these objects: the
+/// state, unchanged and not converged.
 SceneState hold(
     const SceneState& state, StepStatus status, std::vector<int> objects, StepInfo& info, StepRecord* record);
 

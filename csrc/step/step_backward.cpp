@@ -106,8 +106,8 @@ private:
             m_needs, m_gradient.bodies[i], m_control_gradient.bodies[i], m_parameter_gradient);
     }
 
-    /// v̂ = v0 + dt (g + f / m): gravity gets dt times what the velocity at the start gets, from a body that moves by its mean
-    /// velocity half of that.
+    /// v̂ = v0 + dt (g + f / m): gravity gets dt times what the velocity at the start gets, from a body that moves by
+    /// its mean velocity half of that.
     void add_gravity() {
         Vec3 sum = Vec3::Zero();
         for (std::size_t i = 0; i < m_model.bodies.size(); ++i)

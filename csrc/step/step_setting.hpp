@@ -13,8 +13,8 @@ struct StepSetting {
     double dt;      ///< [s]
     StepPart part;  ///< of the step
 
-    /// For how long forces have acted on the velocity that a free body moves with [s]: the whole step, or the half of it
-    /// after which the velocity is the mean one.
+    /// For how long forces have acted on the velocity that a free body moves with [s]: the whole step, or the half of
+    /// it after which the velocity is the mean one.
     double acceleration_time() const { return part == StepPart::places ? 0.5 * dt : dt; }
     /// See ZoneBody::weight.
     double body_weight() const { return part == StepPart::places ? 2.0 : 1.0; }
@@ -23,8 +23,8 @@ struct StepSetting {
 /// d(loss)/d(Parameters): as many entries, of friction none where there is none.
 using ParameterGradient = Parameters;
 
-/// Numbers whose squares are larger count as overflown, be it on the way or in a state: what is computed from smaller ones
-/// is finite, and so it is where single precision is asked for.
+/// Numbers whose squares are larger count as overflown, be it on the way or in a state: what is computed from smaller
+/// ones is finite, and so it is where single precision is asked for.
 inline constexpr double kLargestSquare = 1e76;
 
 }  // namespace diffsim

@@ -91,7 +91,8 @@ bool BlockSystem::factorize_sparse() {
     if (!m_sparse) m_sparse = std::make_unique<SparseFactor>();
     SparseFactor& sparse = *m_sparse;
     if (m_pattern_changed) {
-        // Blocks of the factor: the bodies, then the nodes. Its pairs, sorted: each body's with bodies, then with nodes.
+        // Blocks of the factor: the bodies, then the nodes. Its pairs, sorted: each body's
+        // with bodies, then with nodes.
         const int bodies = m_pattern.body_count;
         std::vector<int> sizes(static_cast<std::size_t>(bodies), 6);
         sizes.resize(static_cast<std::size_t>(bodies + m_pattern.node_count), 3);

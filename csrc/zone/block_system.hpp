@@ -28,11 +28,11 @@ struct BlockPattern {
     }
 };
 
-/// A symmetric positive definite matrix on the graph of a zone's bodies (6 rows each) and cloth nodes (3 rows each), and
-/// its factorization.
+/// A symmetric positive definite matrix on the graph of a zone's bodies (6 rows each) and cloth nodes (3 rows
+/// each), and its factorization.
 ///
-/// One body takes a 6x6 Cholesky factor, a few a dense one, many, or nodes, a sparse one with a fill-reducing order. The
-/// order of all sums is fixed by the pattern.
+/// One body takes a 6x6 Cholesky factor, a few a dense one, many, or nodes, a sparse one with a fill-reducing order.
+/// The order of all sums is fixed by the pattern.
 class BlockSystem {
 public:
     BlockSystem();

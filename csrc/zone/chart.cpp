@@ -21,7 +21,8 @@ Mat3 chart_curvature(const Vec6& y, const Vec3& torque) {
 
 namespace {
 
-/// The diagonal block and the gradient of a body. One that has not turned and carries no torque needs no change of chart.
+/// The diagonal block and the gradient of a body. One that has not turned and carries no
+/// torque needs no change of chart.
 void turn_body(
     const Vec6& y, Curvature curvature, CutShare cut, const Mat3& J, const Vec3& torque, Vec6& gradient, Mat6* block) {
     if (y.head<3>().isZero(0.0)) return;

@@ -12,8 +12,8 @@ void forget_contacts(Zone& zone);
 /// rescued_range.
 void rescue_contacts(Zone& zone);
 
-/// Let every contact's force at a point act at its rest distance, and make contacts this many times stiffer. `zone` is one of
-/// exact contacts.
+/// Let every contact's force at a point act at its rest distance, and make contacts this many times stiffer.
+/// `zone` is one of exact contacts.
 void shift_contacts(Zone& zone, const ZonePoint& point, double stiffening);
 
 /// Contacts that were listed anew have the ranges and push as before.

@@ -92,8 +92,8 @@ struct ContactSet {
 
     /// Remove all but the memory.
     void clear();
-    /// Append a contact; it has the law of those of the same two objects before it, or else `laws` has to receive its own.
-    /// True if so.
+    /// Append a contact; it has the law of those of the same two objects before it, or else `laws` has
+    /// to receive its own. True if so.
     bool append(const Contact& contact, ZoneObject a, ZoneObject b, bool own_law);
     /// Let every contact have a law of its own, in the order of the contacts.
     void split_laws();

@@ -26,8 +26,8 @@ void visit_sides(const std::array<Side, 2>& sides, int count, const BodyPart& bo
     }
 }
 
-/// The derivatives of an active contact and what they are taken along: one or two objects, each a body's twist (6) or the
-/// nodes of a cloth's feature (9).
+/// The derivatives of an active contact and what they are taken along: one or two objects, each a body's twist (6) or
+/// the nodes of a cloth's feature (9).
 struct ContactTerm {
     struct Side {
         int body = kNobody;

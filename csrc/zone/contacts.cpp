@@ -354,8 +354,8 @@ void add_contact_curvature(
 }
 
 double contact_force_sum(const Zone& zone, const ZonePoint& point, std::vector<double>& pushed) {
-    // The errors of one body's contacts may all add up. Those of different bodies are independent: their sum grows with the
-    // root of their number.
+    // The errors of one body's contacts may all add up. Those of different bodies are independent: their sum grows
+    // with the root of their number.
     double force_sum = 0.0;
     pushed.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
     for (const ActiveContact& active : point.active) {

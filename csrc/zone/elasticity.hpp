@@ -2,8 +2,8 @@
 
 #include "zone/zone_derivatives.hpp"
 
-/// The term dt² Ψ of a zone's energy: what strains its cloths (dynamics/cloth_elasticity.hpp). Where Zone::elastic says so there
-/// is none.
+/// The term dt² Ψ of a zone's energy: what strains its cloths (dynamics/cloth_elasticity.hpp). Where
+/// Zone::elastic says so there is none.
 namespace diffsim {
 
 /// The pattern of its Hessian, nodes alone.
@@ -18,8 +18,8 @@ void add_elasticity(
 /// The Hessian alone, whatever Zone::elastic says. Pinned nodes are left out.
 void add_elastic_hessian(const Zone& zone, const ZonePoint& point, CutShare cut, BlockSystem& system);
 
-/// Bound on the sum of the elements' forces: what rounding of distances does to the energy is in proportion. `system` holds the
-/// zone's last Hessian.
+/// Bound on the sum of the elements' forces: what rounding of distances does to the energy is in proportion. `system`
+/// holds the zone's last Hessian.
 double elastic_force_sum(const Zone& zone, const ZonePoint& point, const BlockSystem& system);
 
 /// Where gradients go.

@@ -18,8 +18,8 @@ struct FrictionState : ContactFriction {
     bool is_known = false;  ///< there was a model before
 };
 
-/// Slip of the material points that meet in a contact from the start of the step to its end, along two tangents: slip + rowsᵀ p.
-/// Its bodies and nodes are those of its normal row.
+/// Slip of the material points that meet in a contact from the start of the step to its end, along two tangents: slip +
+/// rowsᵀ p. Its bodies and nodes are those of its normal row.
 struct FrictionRow {
     std::size_t normal = 0;    ///< its contact's row in the model
     double coefficient = 0.0;  ///< μ

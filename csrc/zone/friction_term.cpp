@@ -48,8 +48,8 @@ struct Kind<GroundSide> {
     static constexpr bool is_body = false, is_cloth = false;
 };
 
-/// Adds what closest points and normal change by, where a's point has so many slides and b's so many: with w the offset of the
-/// points, S its slides, W its change with the places and q = n · dS, the points stay closest where
+/// Adds what closest points and normal change by, where a's point has so many slides and b's so many: with w the offset
+/// of the points, S its slides, W its change with the places and q = n · dS, the points stay closest where
 ///     Sᵀ (W δ + S σ) + d q δ = 0.
 template <class A, class B>
 void add_closest_changes(

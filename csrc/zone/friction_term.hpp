@@ -9,8 +9,8 @@ namespace diffsim {
 using SlipChanges = Eigen::Matrix<double, 2, Eigen::Dynamic, 0, 2, 18>;
 using TangentRows = Eigen::Matrix<double, Eigen::Dynamic, 2, 0, 18, 2>;
 
-/// Friction of one contact at the solution. Its forces on the coordinates of both sides, Jᵀ λ with λ the force that holds a back,
-/// change with where the sides are and with how they have moved during the step:
+/// Friction of one contact at the solution. Its forces on the coordinates of both sides, Jᵀ λ with λ the force that
+/// holds a back, change with where the sides are and with how they have moved during the step:
 ///  * slipping, λ = μ force s/|s| follows the slip s and the contact's own force;
 ///  * sticking, λ is whatever keeps the slip where it is: a multiplier of s = 0.
 struct FrictionTerm {

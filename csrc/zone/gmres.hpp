@@ -12,9 +12,9 @@ namespace diffsim {
 /// aᵀ M b
 double mass_dot(const Zone& zone, const Coordinates& a, const Coordinates& b);
 
-/// Solve A x = b by GMRES, `apply(x)` giving A x: meant for A near the unit matrix, as a preconditioner leaves it. `x` holds b,
-/// and receives the solution; add, scale and count are known of vectors like it, `product(a, b)` is their inner product. Returns
-/// the residual that is left, relative to b.
+/// Solve A x = b by GMRES, `apply(x)` giving A x: meant for A near the unit matrix, as a preconditioner leaves it. `x`
+/// holds b, and receives the solution; add, scale and count are known of vectors like it, `product(a, b)` is their
+/// inner product. Returns the residual that is left, relative to b.
 template <class Vector, class Apply, class Product>
 double gmres(const Apply& apply, const Product& product, double tolerance, int max_iterations, Vector& x) {
     const double size = std::sqrt(product(x, x));

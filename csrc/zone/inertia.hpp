@@ -7,8 +7,8 @@ namespace diffsim {
 
 double inertial_energy(const Zone& zone, const Coordinates& y);
 
-/// Add its derivatives, the last ones to be added to those of nodes: what is there by then is all that inertia has to balance,
-/// and its size is noted. Pinned nodes have no gradient, and rows of the unit matrix.
+/// Add its derivatives, the last ones to be added to those of nodes: what is there by then is all that inertia has to
+/// balance, and its size is noted. Pinned nodes have no gradient, and rows of the unit matrix.
 void add_inertia(const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem* system);
 
 /// system += factor * M, but for pinned nodes.

@@ -5,8 +5,8 @@
 /// Matrices over the sides of contacts, as what acts on the coordinates of a zone.
 namespace diffsim {
 
-/// A sum of matrices, not symmetric, each over the sides of one contact. Those of contacts of the same bodies that follow each
-/// other are one.
+/// A sum of matrices, not symmetric, each over the sides of one contact. Those of contacts of the same bodies
+/// that follow each other are one.
 class SideMatrices {
 public:
     void clear() { m_parts.clear(); }

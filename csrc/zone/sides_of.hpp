@@ -5,11 +5,12 @@
 #include "contact/sides.hpp"
 #include "zone/zone_point.hpp"
 
-/// The one place that decodes what the sides of a zone's contacts are: a body, a cloth or the ground, and whether they yield.
+/// The one place that decodes what the sides of a zone's contacts are: a body, a cloth or the
+/// ground, and whether they yield.
 namespace diffsim {
 
-/// Call visit(a, b) with the two sides of a contact, each a SideOfBody or a SideOfCloth, b maybe a SideOfGround. A body comes
-/// before a cloth.
+/// Call visit(a, b) with the two sides of a contact, each a SideOfBody or a SideOfCloth, b maybe a
+/// SideOfGround. A body comes before a cloth.
 template <class Visit>
 decltype(auto) with_sides(const Zone& zone, const ZoneContact& contact, Visit&& visit);
 

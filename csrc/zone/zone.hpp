@@ -11,8 +11,8 @@
 ///
 /// Each body has six coordinates y = (theta, u) around its pose (R0, t0) at the start of the step: R = Exp(theta) R0,
 /// t = t0 + u. Positions are kept relative to the zone's origin, so that rounding does not grow with the distance
-/// from the world's. A cloth node has the coordinates y = u around its position at the start. The step is the minimiser of
-/// [Qiao et al. 2020, Eqs. 2 and 6 together, with contact as an energy]
+/// from the world's. A cloth node has the coordinates y = u around its position at the start. The step is the minimiser
+/// of [Qiao et al. 2020, Eqs. 2 and 6 together, with contact as an energy]
 ///     E(y) = ½ (y - ŷ)ᵀ M (y - ŷ) + dt² Ψ(y) + Σ contact energies,   M = diag(R0 I_b R0ᵀ, m 1), nodes m 1,
 /// with Ψ the elastic potential of the cloths (dynamics/cloth_elasticity.hpp).
 namespace diffsim {
@@ -99,8 +99,8 @@ struct Zone {
 /// Have the vertices of bodies that a contact needs placed with the zone.
 void list_feature_vertices(Zone& zone, const ZoneContact& contact);
 
-/// Make an empty zone in the memory of another one, for bodies and cloths of a model to join: the one way to make a zone.
-/// Compliance 0 asks for exact ones. Returns `zone`.
+/// Make an empty zone in the memory of another one, for bodies and cloths of a model to join: the one way to make a
+/// zone. Compliance 0 asks for exact ones. Returns `zone`.
 Zone& make_zone(
     Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
     const Vec3& origin);

@@ -49,8 +49,8 @@ Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double p
         const double root_mass = std::sqrt(node.mass);
         reference = std::max(reference, (node.last_motion - node.target).norm() * root_mass);
     }
-    // Nothing pushes here and nothing did before: only the exact answer will do, or what rounding makes of a contact that is at
-    // its rest distance.
+    // Nothing pushes here and nothing did before: only the exact answer will do, or what rounding makes of a contact
+    // that is at its rest distance.
     if (!(reference > 0.0)) reference = residual;
     if (!(reference > 0.0)) return {0.0, 0.0, 0.0};
     return {residual / reference, kEpsilon * position * derivatives.largest_stiffness / reference, reference};

@@ -17,7 +17,8 @@ double largest_scaled(const Zone& zone, const Coordinates& g);
 /// Largest |Lᵀ p|.
 double largest_motion(const Zone& zone, const Coordinates& p);
 
-/// From derivatives with a Hessian, or with the contacts' stiffness at least. `position`: size of the numbers that distances are differences of [m].
+/// From derivatives with a Hessian, or with the contacts' stiffness at least. `position`: size of the numbers that
+/// distances are differences of [m].
 Accuracy accuracy(const Zone& zone, const ZoneDerivatives& derivatives, double position);
 
 /// What rounding can do to the energy. `system` holds the zone's last Hessian, `pushed` is scratch.

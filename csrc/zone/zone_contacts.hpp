@@ -22,11 +22,12 @@ struct ContactCoverage {
     } scratch;
 };
 
-/// The distance at which the two features of a contact rest: the sum of their margins. Features of one cloth may be nearer
-/// at rest than its thickness: there they keep half of that.
+/// The distance at which the two features of a contact rest: the sum of their margins. Features of one cloth may be
+/// nearer at rest than its thickness: there they keep half of that.
 double contact_margins(const Model& model, const Contact& contact);
 
-/// Append a contact between two objects of the zone with its range and stiffness; its block of the Hessian is left open.
+/// Append a contact between two objects of the zone with its range and stiffness; its
+/// block of the Hessian is left open.
 void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b);
 
 /// List the zone's contacts, of cloths with themselves too, for motions along the segment from `begin` to `end` and
@@ -48,8 +49,8 @@ struct Impact {
 enum class Clearance { floor, landing };
 
 /// How far the zone may go from an evaluated point towards y_end, vertices on straight lines, before some pair comes
-/// to its clearance, or nearer if it is below that already; at most 1. `impacts`, if given, receives the pairs that do, in
-/// the order of the contacts.
+/// to its clearance, or nearer if it is below that already; at most 1. `impacts`, if given, receives the pairs that do,
+/// in the order of the contacts.
 double allowed_step(
     const Zone& zone, const ZonePoint& point, const Coordinates& y_end, std::vector<Impact>* impacts,
     Clearance clearance = Clearance::floor);

@@ -2,9 +2,9 @@
 
 #include "zone/zone_point.hpp"
 
-/// First and second derivative of a zone's energy, along its coordinates. The terms of the energy are in files of their own,
-/// each with what it adds to the pattern of the Hessian, to the energy, to the derivatives and to their rounding: inertia,
-/// elasticity, contacts.
+/// First and second derivative of a zone's energy, along its coordinates. The terms of the energy are in files of their
+/// own, each with what it adds to the pattern of the Hessian, to the energy, to the derivatives and to their rounding:
+/// inertia, elasticity, contacts.
 namespace diffsim {
 
 /// How the second derivative is taken.
@@ -33,9 +33,9 @@ struct ZoneDerivatives {
 /// The pattern of a zone's Hessian without the contacts of cloth.
 BlockPattern base_pattern(const Zone& zone);
 
-/// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's base pattern, and is extended
-/// by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix. With all negative
-/// curvature cut off (CutShare), the contacts' part is positive semidefinite as well.
+/// Gradient and Hessian of the energy at an evaluated point. `system` must have the zone's base pattern, and is
+/// extended by the pairs of the contacts that are active. Rows of pinned nodes are those of the unit matrix. With all
+/// negative curvature cut off (CutShare), the contacts' part is positive semidefinite as well.
 void differentiate(
     const Zone& zone, const ZonePoint& point, Curvature curvature, ZoneDerivatives& derivatives, BlockSystem* system,
     CutShare cut = kNothingCut);
@@ -47,8 +47,8 @@ struct PushingContact {
     double force;  ///< [kg·m]
 };
 
-/// The Hessian of inertia and elasticity, and what contacts that push with these forces add to it by their curvature alone,
-/// so much of the negative curvature cut off. `system` has a pattern of these contacts.
+/// The Hessian of inertia and elasticity, and what contacts that push with these forces add to it by their curvature
+/// alone, so much of the negative curvature cut off. `system` has a pattern of these contacts.
 void differentiate_smooth(
     const Zone& zone, const ZonePoint& point, const std::vector<PushingContact>& pushing, CutShare cut,
     ZoneDerivatives& derivatives, BlockSystem& system);

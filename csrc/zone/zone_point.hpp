@@ -27,8 +27,8 @@ struct ZonePoint {
     double elastic_energy = 0.0;  ///< the cloths' part, dt² Ψ
 };
 
-/// Find the rest of a point from its coordinates. `before`: a point that was evaluated with the same list of contacts, or
-/// null. Pairs that cannot have come near since then are left out, with what is known of their distances.
+/// Find the rest of a point from its coordinates. `before`: a point that was evaluated with the same list of contacts,
+/// or null. Pairs that cannot have come near since then are left out, with what is known of their distances.
 void evaluate(const Zone& zone, ZonePoint& point, const ZonePoint* before = nullptr);
 
 /// Where bodies and nodes are at these coordinates.

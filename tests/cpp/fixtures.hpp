@@ -13,7 +13,7 @@ namespace fixtures {
 
 using namespace diffsim;
 
-// --- random values -----------------------------------------------------------------------------------------------------
+// --- random values ---------------------------------------------------------------------------------------------------
 
 Vec3 random_vec3(check::Random& random, double size = 1.0);
 Vec3 random_direction(check::Random& random);
@@ -22,7 +22,7 @@ Mat3 random_rotation(check::Random& random);
 /// Symmetric positive definite with eigenvalues from 1 to `ratio`.
 Mat3 random_inertia(check::Random& random, double ratio);
 
-// --- numeric derivatives -------------------------------------------------------------------------------------------------
+// --- numeric derivatives ---------------------------------------------------------------------------------------------
 
 /// Jacobian by fourth-order central differences: truncation O(step⁴), rounding O(eps / step).
 template <typename Function>
@@ -47,7 +47,7 @@ VectorX numeric_gradient(const Function& function, const VectorX& x, double step
     return numeric_jacobian([&](const VectorX& at) { return VectorX::Constant(1, function(at)); }, x, step).transpose();
 }
 
-// --- meshes --------------------------------------------------------------------------------------------------------------
+// --- meshes ----------------------------------------------------------------------------------------------------------
 
 struct TriangleMesh {
     std::vector<Vec3> vertices;
@@ -67,7 +67,7 @@ CollisionMesh collision_mesh(const TriangleMesh& mesh);
 /// A convex polygon inscribed in an ellipse, in the plane through `center` with these axes.
 std::vector<Vec3> random_polygon(check::Random& random, int count);
 
-// --- bodies --------------------------------------------------------------------------------------------------------------
+// --- bodies ----------------------------------------------------------------------------------------------------------
 
 Body body(const TriangleMesh& mesh, double margin, BodyKind kind = BodyKind::dynamic);
 Mat3 box_inertia(const Vec3& half, double mass);

@@ -118,7 +118,8 @@ struct Scene {
     }
 };
 
-/// Two boxes on the ground, a box that bridges them, and one on top: many more contact rows than they can be independent.
+/// Two boxes on the ground, a box that bridges them, and one on top: many more contact rows
+/// than they can be independent.
 Scene stack() {
     Scene scene;
     scene.model.thickness = kThickness;
@@ -144,8 +145,8 @@ Scene landing() {
     return scene;
 }
 
-/// A box that lands on a sheet held at its corners, above a fixed block and next to a small sheet on the ground, of which
-/// it hits the edge.
+/// A box that lands on a sheet held at its corners, above a fixed block and next to a small sheet on the
+/// ground, of which it hits the edge.
 Scene caught() {
     Scene scene;
     scene.model.thickness = kThickness;
@@ -414,7 +415,8 @@ TEST(exact_adjoint_agrees_with_differences_of_the_solve) {
             CHECK(by_target.norm() > 1e-2);
             CHECK_NEAR(by_target, fixtures::numeric_gradient(targeted, VectorX::Zero(6), kStep), kDifferences);
 
-            // The base pose moves, targets and inertia stay: a turn arrives at the end of the step turned by Exp(theta).
+            // The base pose moves, targets and inertia stay: a turn arrives at the end of
+            // the step turned by Exp(theta).
             const Vec6& pose = adjoint.pose_gradient.bodies[i];
             by_start << exp_rotation(point.y.bodies[i].head<3>()).transpose() * pose.head<3>(), pose.tail<3>();
             const auto started = [&](const VectorX& x) {

@@ -51,8 +51,8 @@ double edge_distance(const Edge& a, const std::vector<Vec3>& xa, const Edge& b, 
     return closest_edge_edge(xa[a.p0], xa[a.p1], xb[b.p0], xb[b.p1]).distance();
 }
 
-/// All pairs of features nearer than `reach` at some sampled time of the one's motion and of the other's, by trying all of
-/// them: one may be stopped where the other goes on.
+/// All pairs of features nearer than `reach` at some sampled time of the one's motion and of the other's, by trying all
+/// of them: one may be stopped where the other goes on.
 std::set<Key> near_pairs(const SweptMesh& a, const SweptMesh& b, double reach) {
     std::set<Key> result;
     constexpr std::array<std::array<double, 2>, 8> kTimes = {

@@ -219,8 +219,8 @@ TEST(advances_that_run_out_end_early_and_never_in_a_miss) {
     CHECK(cut_short >= 500);
 }
 
-// A wire of .1 mm lies under a sheet whose triangles are .1 m wide: how far the sheet swings and slides in a step is huge
-// against the hundredth of the wire's thickness that is kept.
+// A wire of .1 mm lies under a sheet whose triangles are .1 m wide: how far the sheet swings and slides in a step is
+// huge against the hundredth of the wire's thickness that is kept.
 TEST(a_thin_wire_under_a_sheet_takes_few_advances) {
     CcdOptions options;
     options.min_distance = 1e-5;

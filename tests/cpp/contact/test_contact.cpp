@@ -258,7 +258,8 @@ TEST(derivatives_of_edges_that_are_parallel_up_to_rounding_are_finite) {
 
 TEST(on_the_border_of_a_feature_second_derivatives_are_the_mean_of_both_sides) {
     // Equal boxes, one exactly above the other or shifted along a side: corners above corners and edges, edges that
-    // cross at their ends. Central differences of the gradient take the mean, too, and are exact to the first order there.
+    // cross at their ends. Central differences of the gradient take the mean, too, and are
+    // exact to the first order there.
     constexpr double kSmallStep = 1e-6, kFirstOrder = 1e-4;
     const Model model = two_bodies();
     const CollisionMesh& mesh = model.bodies[0].mesh;

@@ -23,8 +23,8 @@ constexpr double kDifferences = 1e-7;
 // points carry rounding of eps / 0.01².
 constexpr double kMollifiedDifferences = 1e-5;
 
-/// A contact of a rigid body or a cloth with a cloth, in the coordinates that its derivatives are taken along: the twist of
-/// the body, the three nodes of a feature (an edge and a vertex leave some out).
+/// A contact of a rigid body or a cloth with a cloth, in the coordinates that its derivatives are taken along: the
+/// twist of the body, the three nodes of a feature (an edge and a vertex leave some out).
 struct Situation {
     bool body_a;  ///< what a is
     CollisionMesh mesh_a, mesh_b;

@@ -211,8 +211,8 @@ TEST(edge_edge_in_degenerate_positions) {
 }
 
 TEST(nearly_parallel_edges_keep_their_distance) {
-    // Crossing at the middle, `gap` apart. Points that are off by delta along the edges see sqrt(gap² + delta²), too much:
-    // CCD, which may come this close, keeps a tolerance of a tenth.
+    // Crossing at the middle, `gap` apart. Points that are off by delta along the edges see sqrt(gap² + delta²), too
+    // much: CCD, which may come this close, keeps a tolerance of a tenth.
     constexpr double kClose = 1e-4;
     check::Random random(7);
     int cases_hit = 0;

@@ -9,8 +9,8 @@ using namespace diffsim;
 
 namespace {
 
-/// S = A - B with A, B positive semidefinite on spaces normal to each other: A is the positive part. Only what is tested has a
-/// fixed size: five of each would take the compiler longest of all.
+/// S = A - B with A, B positive semidefinite on spaces normal to each other: A is the positive part. Only what is
+/// tested has a fixed size: five of each would take the compiler longest of all.
 template <int N>
 void check_size() {
     using Matrix = Eigen::Matrix<double, N, N>;

@@ -43,8 +43,8 @@ struct Scene {
         zone.bodies.back().target = target;
         ++zone.dynamic_count;
     }
-    /// Two tilted boxes, a corner of one near a face of the other, about to turn and move into each other. `size` of the
-    /// motion: 1 is far for the boxes.
+    /// Two tilted boxes, a corner of one near a face of the other, about to turn and move into each other. `size` of
+    /// the motion: 1 is far for the boxes.
     void add_pair(check::Random& random, double size) {
         const Mat3 tilt = exp_rotation(3.0 * fixtures::random_direction(random));
         const double reach = (tilt * Vec3::Constant(kHalf).cwiseProduct(tilt.row(2).transpose().cwiseSign())).z();

@@ -16,7 +16,8 @@ namespace {
 constexpr double kThickness = 1e-3;
 constexpr double kStep = 1e-7;
 
-/// Two boxes that push each other and have turned and slipped since the step began: by an edge of each, or a corner in a face.
+/// Two boxes that push each other and have turned and slipped since the step began: by an edge
+/// of each, or a corner in a face.
 struct Boxes {
     Model model;
     std::vector<ClothParameters> materials;

@@ -176,8 +176,8 @@ double lowest_eigenvalue(const MatrixX& symmetric) {
     return Eigen::SelfAdjointEigenSolver<MatrixX>(symmetric, Eigen::EigenvaluesOnly).eigenvalues()[0];
 }
 
-/// How many active contacts of each kind: a body and a cloth, a fixed body and a cloth, cloth and the ground, two cloths,
-/// one with itself.
+/// How many active contacts of each kind: a body and a cloth, a fixed body and a cloth, cloth and the
+/// ground, two cloths, one with itself.
 std::array<int, 5> count_kinds(const Zone& zone, const ZonePoint& point) {
     std::array<int, 5> counts = {};
     for (const ActiveContact& active : point.active) {
