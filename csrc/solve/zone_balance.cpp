@@ -87,9 +87,9 @@ private:
         return std::any_of(zone().bodies.begin() + zone().dynamic_count, zone().bodies.end(), moves);
     }
 
-    /// From the first point where all that is driven is at its target, with what is left of the balance there held back:
-    /// F(y) = (1 - t) F(first), t from 0 to 1 in parts that double and halve. Where contacts turn on the way, so that models of all
-    /// of it lead past each other, each part is reached from the last.
+    /// From the first point where all that is driven is at its target, with what is left of the balance there held
+    /// back: F(y) = (1 - t) F(first), t from 0 to 1 in parts that double and halve. Where contacts turn on the way, so
+    /// that models of all of it lead past each other, each part is reached from the last.
     StepStatus search_in_parts(StepStatus status) {
         m_in_parts = true;
         Start begin = m_first;
