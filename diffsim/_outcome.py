@@ -148,7 +148,7 @@ _MAX_FAILURES = 256  # the core lists no more of a segment
 # What to try, by why the core says a step failed.
 MENDS = {
     "max_iterations reached": "try a larger max_iterations or a smaller dt",
-    "no balance of friction was found in 10,000 factorizations": (
+    "no balance of friction was found in thousands of factorizations": (
         "check what jams something, try a smaller dt or smaller coefficients of friction"
     ),
     "no step lowers the energy": "try a smaller dt or a larger tolerance",

@@ -145,7 +145,7 @@ const char* failure_text(StepStatus status) {
         case StepStatus::too_many_iterations:
             return "max_iterations reached";
         case StepStatus::crawls:
-            return "no balance of friction was found in 10,000 factorizations";
+            return "no balance of friction was found in thousands of factorizations";
         case StepStatus::no_descent:
             return "no step lowers the energy";
         case StepStatus::spinning:

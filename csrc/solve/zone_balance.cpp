@@ -58,7 +58,7 @@ private:
             if (iterations == 0 && driven && !m_in_parts && rests(now)) return StepStatus::converged;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
             m_factors += way.newton_steps;
-            if (m_factors > (m_in_parts ? kMaxFactors : kMaxAtOnce)) return StepStatus::crawls;
+            if (m_factors > (m_in_parts || is_driven() ? kMaxFactors : kMaxAtOnce)) return StepStatus::crawls;
             if (!way.found) return StepStatus::no_descent;
             const double motion = motion_to_end();
             const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
@@ -199,11 +199,8 @@ private:
 
     /// Whether energy and what friction takes up rise; then the model is damped.
     bool rises(double step) {
-        double change = m_work.trial.energy - m_work.point.energy + m_model.friction_work(step);
-        for (std::size_t i = 0; i < m_held.bodies.size(); ++i)
-            change -= m_held.bodies[i].dot(m_work.trial.y.bodies[i] - m_work.point.y.bodies[i]);
-        for (std::size_t i = 0; i < m_held.nodes.size(); ++i)
-            change -= m_held.nodes[i].dot(m_work.trial.y.nodes[i] - m_work.point.y.nodes[i]);
+        const double work = dot(m_held, m_work.trial.y) - dot(m_held, m_work.point.y);  // of what is held back
+        const double change = m_work.trial.energy - m_work.point.energy - work + m_model.friction_work(step);
         if (change <= m_search.current_noise()) return false;
         if (++m_damped > kMaxDamped) {
             m_model.forget_damping();
