@@ -22,7 +22,7 @@ struct Problem {
     BalanceWorkspace workspace;
     Coordinates p;
 
-    explicit Problem(check::Random& random) {
+    explicit Problem(check::Random& random, double coefficient = 0.5) {
         for (int i = 0; i < 2; ++i) zone.bodies.push_back(fixtures::zone_body(i, Pose(), 1.0, Mat3::Identity()));
         zone.dynamic_count = 2;
         model.smooth.set_pattern({2, 0, {{0, 1}}, {}, {}});
@@ -33,11 +33,11 @@ struct Problem {
             model.gradient.bodies.push_back(0.1 * random.vector(6));
         }
         for (const int b : {-1, 1})
-            for (int k = 0; k < 3; ++k) add_contact(random, b);
+            for (int k = 0; k < 3; ++k) add_contact(random, b, coefficient);
         p.assign_zero(2, 0);
     }
 
-    void add_contact(check::Random& random, int b) {
+    void add_contact(check::Random& random, int b, double coefficient) {
         const Mat3 frame = fixtures::random_rotation(random);
         const auto along = [&](const Vec3& direction) {
             Vector<9> relative;
@@ -55,7 +55,7 @@ struct Problem {
         row.range = 0.1;
         FrictionRow slip;
         slip.normal = model.rows.size();
-        slip.coefficient = 0.5;
+        slip.coefficient = coefficient;
         slip.tangents = {frame.col(0), frame.col(1)};
         slip.relative = {along(frame.col(0)), along(frame.col(1))};
         slip.slip = 0.002 * random.vector(2);
@@ -146,6 +146,23 @@ TEST(a_model_with_friction_is_in_balance_where_its_contacts_stick_and_slip) {
     }
     CHECK(slipping >= 10);
     CHECK(sticking >= 10);
+}
+
+TEST(models_are_solved_where_newtons_method_and_rounds_of_bounds_that_stand_still_crawl) {
+    int slipping = 0, sticking = 0;
+    for (unsigned trial = 0; trial < 300; ++trial) {  // 16 of them crawl
+        check::Random random(trial);
+        constexpr double kLarge = 3.0;
+        Problem problem(random, kLarge);
+        for (int k = 0; k < 4; ++k) problem.add_contact(random, 1, kLarge);
+        for (Vec6& g : problem.model.gradient.bodies) g *= 30.0;
+        CHECK(problem.solve().status == ModelSolution::Status::solved);
+        CHECK(problem.left().norm() <= 10.0 * kTolerance);
+        for (const FrictionRow& slip : problem.model.friction)
+            if (problem.model.rows[slip.normal].force > 0.0) ++(slip.slips ? slipping : sticking);
+    }
+    CHECK(slipping >= 50);
+    CHECK(sticking >= 50);
 }
 
 TEST(a_model_that_crawls_with_turns_is_solved_without_them_from_the_states_it_began_with) {
