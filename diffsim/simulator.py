@@ -75,8 +75,8 @@ class Simulator(SceneIdentity, Measurements):
             Eq. 3. Meant to show what that leaves out: there are no gradients, and `info.converged` does not speak of
             these iterates. Default: as many as it takes to converge.
         tolerance: Relative KKT residual at which a step has converged.
-        max_iterations: Newton iterations a step may take; with friction those of the whole load at once, after which it
-            is brought about in parts of a few each (docs/friction.md). Default: 200, in scenes with cloth 2000.
+        max_iterations: Newton iterations a step may take; with friction those of the first search, after which
+            others begin (docs/friction.md). Default: 200, in scenes with cloth 2000.
         num_threads: How many threads a call may use; no result depends on it. They divide the scenes of a batch, or,
             where there are fewer scenes than threads, the bodies and zones of one big scene: up to some 60 bodies in
             contact one thread is faster alone. Default: `torch.get_num_threads()`.

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Geometry>
+#include <tuple>
 
 #include "collision/candidates.hpp"
 #include "contact/law.hpp"
@@ -36,6 +37,12 @@ struct Contact {
         return {type == ContactType::edge_edge ? FeatureKind::edge : other, feature_b};
     }
 };
+
+/// An order for lists of contacts that are looked up.
+inline bool comes_before(const Contact& c, const Contact& d) {
+    return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
+           std::tie(d.object_a, d.object_b, d.type, d.feature_a, d.feature_b);
+}
 
 /// What the multiplier of an exact contact follows from: it acts as one with this compliance
 /// and its rest distance shifted.

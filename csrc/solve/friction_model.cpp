@@ -4,27 +4,22 @@
 #include <cmath>
 
 #include "zone/gmres.hpp"
-#include "zone/inertia.hpp"
 #include "zone/zone_accuracy.hpp"
 
 namespace diffsim {
 namespace {
 
 constexpr int kCrawlAfter = 10;        // Newton steps before turns are left out, then before all goes in small steps
-constexpr int kMaxBalanceSteps = 300;  // of all kinds
+constexpr int kMaxBalanceSteps = 300;  // until bounds stop standing still
+constexpr int kMaxConvexSteps = 60;    // where bounds stand still; less than half of them are seen
 constexpr double kBoundChange = 0.1;   // of the largest: bounds that change less may follow again
 constexpr int kMaxFrozenRounds = 10;   // of bounds that stand still
-constexpr int kFlowSteps = 4;          // Newton steps of one in pseudo-time
-constexpr double kFlowAccuracy = 0.1;  // of what is left at its begin: to which its end is found
 
 constexpr int kMaxBisections = 30;    // bisections of a line search
 constexpr double kFlat = 0.1;         // of the slope at the start: that at the end of a step taken in full
 constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow would change
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
-constexpr double kColdShare = 0.5;      // of what a bound presses its contact by: FrictionRow::reach
-constexpr double kSlipShare = 0.07;     // the same near the balance
-constexpr double kHoldingShare = 2e-3;  // and where only slips of sticking contacts are left to end
 constexpr double kSettledReach = 0.01;  // of its slip
 constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
 
@@ -44,6 +39,7 @@ public:
           m_p(p) {}
 
     ModelSolution run() {
+        if (m_goal.stands_still) return minimise();
         set_reach();
         const Coordinates start = m_p;
         const std::vector<FrictionRow> states = m_friction;
@@ -58,6 +54,17 @@ public:
     }
 
 private:
+    /// Where all bounds stand still.
+    ModelSolution minimise() {
+        m_frozen = true;
+        m_w.bound.resize(m_friction.size());
+        for (std::size_t f = 0; f < m_friction.size(); ++f) m_w.bound[f] = m_friction[f].bound;
+        while (find_left() > m_goal.tolerance && m_result.newton_steps < kMaxConvexSteps)
+            if (!newton_step()) return m_result;
+        finish(ModelSolution::Status::solved);
+        return m_result;
+    }
+
     /// From where p and the states are. False where it crawls with turns, and is given up.
     bool solve() {
         look();
@@ -66,7 +73,7 @@ private:
         if (pace == Pace::crawls && !m_model.turns.empty()) return false;
         if (pace == Pace::crawls) pace = follow_in_rounds();
         if (pace == Pace::crawls) pace = newton();
-        if (pace == Pace::crawls) flow();
+        if (pace == Pace::crawls) finish(ModelSolution::Status::crawling);
         return true;
     }
 
@@ -108,39 +115,6 @@ private:
             m_w.bound[f] = now;
         }
         return largest > 0.0 ? change / largest : 0.0;
-    }
-
-    /// Along M dp/dτ = -F(p), F what is left of the balance, by implicit Euler steps in a pseudo-time that double
-    /// where Newton's method finds their ends. Where bounds that follow the forces feed themselves, Newton's own steps
-    /// go to and fro between contacts that stick and slip, and rounds of bounds that stand still lead away, while this
-    /// goes on until something holds.
-    void flow() {
-        double duration = 1.0;  // in which inertia alone takes half of F away
-        for (double left = find_left(); left > m_goal.tolerance; left = find_left()) {
-            if (m_result.newton_steps >= kMaxBalanceSteps) return finish(ModelSolution::Status::crawling);
-            const Coordinates begin = m_p;
-            bool found = false;
-            for (int k = 0; k < kFlowSteps && !found; ++k) {
-                if (!factorize(1.0 / duration)) return;
-                ++m_result.newton_steps;
-                hold_to(begin, 1.0 / duration);
-                solve_step(bounds_matter());
-                add(1.0, m_w.step, m_p);
-                find_left();
-                hold_to(begin, 1.0 / duration);
-                found = largest_scaled(m_zone, m_w.gradient) <= kFlowAccuracy * left;
-            }
-            if (!found) m_p = begin;
-            duration *= found ? 2.0 : 0.25;
-        }
-        finish(ModelSolution::Status::solved);
-    }
-
-    /// The balance, with so much more inertia from there on.
-    void hold_to(const Coordinates& begin, double weight) {
-        m_w.held = m_p;
-        add(-1.0, begin, m_w.held);
-        add_mass_product(m_zone, weight, m_w.held, m_w.gradient);
     }
 
     void finish(ModelSolution::Status status) {
@@ -213,11 +187,10 @@ private:
         }
     }
 
-    /// The balance with these forces, and the symmetric matrix for bounds that stay. `weight`: of so much more inertia.
-    bool factorize(double weight = 0.0) {
+    /// The balance with these forces, and the symmetric matrix for bounds that stay.
+    bool factorize() {
         m_system.copy_values(m_model.smooth);
         add_all(&m_system);
-        if (weight > 0.0) add_mass_matrix(m_zone, weight, m_system);
         return m_system.factorize();
     }
 

@@ -11,8 +11,7 @@
 ///     H p + g - Σ force row + Σ rows_s μ force u = 0
 /// is found by Newton's method, whose matrix S - N is not symmetric: S is what it is for bounds that stay as they
 /// are, N what they change by. GMRES with the factor of S solves with it, and with what S leaves out of contacts
-/// that turn. Where that does not end it, p follows M dp/dτ = -F(p), F the left side (pseudo-transient
-/// continuation, Kelley and Keyes 1998).
+/// that turn.
 namespace diffsim {
 
 /// What a model with friction is asked for.
@@ -21,14 +20,20 @@ struct BalanceGoal {
     /// Contacts mostly go on as in the last model: those that slip in a direction that is made exact. Compressed ones
     /// have their stiffness, not the secant's.
     bool is_settled = false;
-    bool turns = false;        ///< what rows do not see of contacts is in the model, too; see FrictionTurns
-    bool is_balanced = false;  ///< only slips of sticking contacts are left to end
-    bool may_crawl = true;     ///< a model that is not solved to its end is of use
+    bool turns = false;         ///< what rows do not see of contacts is in the model, too; see FrictionTurns
+    bool is_balanced = false;   ///< only slips of sticking contacts are left to end
+    bool may_crawl = true;      ///< a model that is not solved to its end is of use
+    bool stands_still = false;  ///< FrictionRow::bound and ::reach are given, and stay: a convex minimisation
 };
+
+// How far slips reach, of what a bound presses its contact by: see FrictionRow::reach.
+inline constexpr double kColdShare = 0.5;
+inline constexpr double kSlipShare = 0.07;     ///< near the balance
+inline constexpr double kHoldingShare = 2e-3;  ///< and where only slips of sticking contacts are left to end
 
 /// Memory of balance(), kept from model to model.
 struct BalanceWorkspace {
-    Coordinates smooth_p, gradient, step, smooth_step, held;
+    Coordinates smooth_p, gradient, step, smooth_step;
     std::vector<double> violation, slope, bound;
     std::vector<char> pushes;
     std::vector<Vec2> slip, slip_step, pull;

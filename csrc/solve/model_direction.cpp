@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <tuple>
 
 #include "zone/contacts.hpp"
 #include "zone/motion_bounds.hpp"
@@ -15,11 +14,6 @@ namespace {
 constexpr double kMaxTurn = 0.5;                              // [rad] of a fast body in one way
 constexpr double kCrawling = 0.2;                             // of a Newton step: rows are not followed so
 constexpr std::array<double, 3> kStages = {1e-2, 1e-1, 1.0};  // of the rows' stiffness
-
-bool before(const Contact& c, const Contact& d) {
-    return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
-           std::tie(d.object_a, d.object_b, d.type, d.feature_a, d.feature_b);
-}
 
 }  // namespace
 
@@ -38,8 +32,8 @@ void ModelDirection::recall_forces() {
         const Contact& contact = m_zone.contacts[k].contact;
         const auto found = std::lower_bound(
             m_kept.begin(), m_kept.end(), contact,
-            [](const Kept& kept, const Contact& c) { return before(kept.contact, c); });
-        if (found == m_kept.end() || before(contact, found->contact)) continue;
+            [](const Kept& kept, const Contact& c) { return comes_before(kept.contact, c); });
+        if (found == m_kept.end() || comes_before(contact, found->contact)) continue;
         m_forces[k] = found->force;
         if (!m_friction.empty()) m_friction[k] = found->friction;
     }
@@ -81,7 +75,8 @@ void ModelDirection::keep_forces() {
 }
 
 void ModelDirection::sort_kept() {
-    std::sort(m_kept.begin(), m_kept.end(), [](const Kept& a, const Kept& b) { return before(a.contact, b.contact); });
+    std::sort(
+        m_kept.begin(), m_kept.end(), [](const Kept& a, const Kept& b) { return comes_before(a.contact, b.contact); });
 }
 
 // --- the model -------------------------------------------------------------------------------------------------------

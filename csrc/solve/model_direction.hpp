@@ -42,12 +42,17 @@ public:
     /// Of models with friction.
     void aim_for(const BalanceGoal& goal) { m_goal = goal; }
 
-    /// Add what friction does at the point, its contacts' shares of their bounds being those of the last model.
+    /// Add what friction does at the point, its contacts' shares of their bounds being those of the last model, or
+    /// those that its slips have where bounds stand still.
     void add_friction_forces(Coordinates& gradient);
     /// Of contacts that push at the point, as a motion; see largest_motion().
     double largest_slip() const;
     /// What friction takes up on this part of the last way, its bounds those of the last model.
     double friction_work(double step) const;
+    /// Let the bounds of friction stay what forces make them at the point, from model to model, so that the models are
+    /// those of an energy. What sticks is held from where it is on. `share`: see FrictionRow::reach.
+    void stop_bounds(double share);
+    void let_bounds_follow() { m_stopped.clear(); }
     /// The states of the last model, one per contact of the zone.
     const std::vector<FrictionState>& friction() {
         recall_forces();
@@ -78,8 +83,20 @@ private:
         double wanted;     ///< from which distance on it pushes [m]
     };
 
+    /// Friction of a contact whose bound stands still.
+    struct Stopped {
+        Contact contact;
+        double bound, reach;
+        Vec3 multiplier;
+
+        Vec2 stretch(const FrictionRow& slip) const;
+        Vec2 pull(const FrictionRow& slip) const;
+    };
+
     void recall_forces();
     void keep_forces();
+    const Stopped* find_stopped(const Contact& contact) const;
+    void add_stopped_forces(Coordinates& gradient) const;
     void sort_kept();
     void list_near();
     void add_near(int index);
@@ -125,6 +142,7 @@ private:
     std::vector<double> m_forces;           // of the last model, per contact of the zone
     std::vector<FrictionState> m_friction;  // the same; empty where there is none
     Memory m_kept;                          // the same, by contact, across lists
+    std::vector<Stopped> m_stopped;         // by contact
     BalanceGoal m_goal;
     BalanceWorkspace m_balance;
     Coordinates m_way;             // the last way, from the point

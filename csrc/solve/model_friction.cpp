@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "solve/model_direction.hpp"
+#include "zone/contacts.hpp"
 #include "zone/sides_of.hpp"
 
 /// What friction adds to the models of a zone.
@@ -13,8 +14,65 @@ void ModelDirection::advance_multipliers() {
     for (Kept& kept : m_kept) kept.friction.multiplier = kept.friction.share;
 }
 
+/// What its spring is stretched by, from the multiplier on.
+Vec2 ModelDirection::Stopped::stretch(const FrictionRow& slip) const {
+    return slip.slip + reach * Vec2(slip.tangents[0].dot(multiplier), slip.tangents[1].dot(multiplier));
+}
+
+Vec2 ModelDirection::Stopped::pull(const FrictionRow& slip) const {
+    const Vec2 w = stretch(slip);
+    return bound / std::max(w.norm(), reach) * w;
+}
+
+void ModelDirection::stop_bounds(double share) {
+    recall_forces();
+    std::vector<Stopped> stopped;
+    const Placement at{m_point.y, m_point.poses, m_point.nodes};
+    for (const ActiveContact& active : m_point.active) {
+        const ZoneContact& contact = m_zone.contacts[active.index];
+        const double bound = contact.law.friction * contact_force(active.geometry, contact.law);
+        if (!(bound > 0.0)) continue;
+        FrictionState& state = m_friction[static_cast<std::size_t>(active.index)];
+        if (const Stopped* before = find_stopped(contact.contact)) {
+            const FrictionRow slip = make_friction_row(m_zone, contact, active.geometry, at, at.y);
+            const Vec2 pulled = before->pull(slip) / before->bound;
+            state.slips = before->stretch(slip).norm() > before->reach;
+            state.share = pulled[0] * slip.tangents[0] + pulled[1] * slip.tangents[1];
+            state.is_known = true;
+        }
+        const double compression = contact.law.range.rest - active.geometry.distance;
+        stopped.push_back({contact.contact, bound, share * contact.law.friction * compression, state.share});
+    }
+    std::sort(stopped.begin(), stopped.end(), [](const auto& a, const auto& b) {
+        return comes_before(a.contact, b.contact);
+    });
+    m_stopped = std::move(stopped);
+}
+
+const ModelDirection::Stopped* ModelDirection::find_stopped(const Contact& contact) const {
+    const auto found = std::lower_bound(
+        m_stopped.begin(), m_stopped.end(), contact,
+        [](const Stopped& stopped, const Contact& c) { return comes_before(stopped.contact, c); });
+    return found == m_stopped.end() || comes_before(contact, found->contact) ? nullptr : &*found;
+}
+
+/// Of contacts that have opened since, too: else they would be no forces of an energy.
+void ModelDirection::add_stopped_forces(Coordinates& gradient) const {
+    const Placement at{m_point.y, m_point.poses, m_point.nodes};
+    for (const ZoneContact& contact : m_zone.contacts) {
+        const Stopped* stopped = find_stopped(contact.contact);
+        if (stopped == nullptr) continue;
+        const ContactGeometry geometry = contact_geometry(m_zone, contact, m_point.poses, m_point.nodes);
+        if (geometry.sine_sq == 0.0) continue;
+        const ContactRow row = make_row(m_zone, contact, geometry, at, at.y, 0.0);
+        const FrictionRow slip = make_friction_row(m_zone, contact, geometry, at, at.y);
+        add_friction(slip, row, stopped->pull(slip), gradient);
+    }
+}
+
 void ModelDirection::add_friction_forces(Coordinates& gradient) {
     recall_forces();
+    if (!m_stopped.empty()) return add_stopped_forces(gradient);
     const Placement at{m_point.y, m_point.poses, m_point.nodes};
     for (const ActiveContact& active : m_point.active) {
         const FrictionState& state = m_friction[static_cast<std::size_t>(active.index)];
@@ -52,6 +110,7 @@ double ModelDirection::largest_slip() const {
 }
 
 double ModelDirection::friction_work(double step) const {
+    const bool stopped = !m_stopped.empty();
     const auto energy = [](const Vec2& slip, double reach) {
         const double size = slip.norm();
         return size > reach ? size - 0.5 * reach : 0.5 * size * size / reach;
@@ -61,9 +120,10 @@ double ModelDirection::friction_work(double step) const {
     double sum = 0.0;
     for (std::size_t f = 0; f < m_model.friction.size(); ++f) {
         const FrictionRow& slip = m_model.friction[f];
-        const double bound = slip.coefficient * m_model.rows[slip.normal].force;
+        const double bound = stopped ? slip.bound : slip.coefficient * m_model.rows[slip.normal].force;
         if (!(bound > 0.0)) continue;
-        sum += bound * (energy(slip.slip + step * moved[f], slip.reach) - energy(slip.slip, slip.reach));
+        const Vec2 begin = stopped ? Vec2(slip.slip + slip.reach * slip.multiplier) : slip.slip;
+        sum += bound * (energy(begin + step * moved[f], slip.reach) - energy(begin, slip.reach));
     }
     return sum;
 }
@@ -75,6 +135,13 @@ void ModelDirection::add_friction_row(const NearContact& near, const ContactGeom
     FrictionRow slip = make_friction_row(m_zone, contact, geometry, m_at, m_point.y);
     slip.normal = m_model.rows.size() - 1;
     slip.set_state(m_friction[static_cast<std::size_t>(near.contact)]);
+    if (!m_stopped.empty()) {
+        const Stopped* stopped = find_stopped(contact.contact);
+        slip.bound = stopped != nullptr ? stopped->bound : 0.0;
+        slip.reach = stopped != nullptr ? stopped->reach : contact.law.range.rest;
+        slip.multiplier.setZero();
+        if (stopped != nullptr) slip.multiplier = (stopped->stretch(slip) - slip.slip) / stopped->reach;
+    }
     m_model.friction.push_back(std::move(slip));
 }
 

@@ -14,8 +14,13 @@ constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
 constexpr int kMaxDamped = 4;       // models in a row: what friction takes up is known of the last model's bounds alone
 constexpr double kRest = 1e-12;     // of the forces: a model that moves nothing further has found the balance
 constexpr int kMaxFactors = 10000;  // of all models of a step
-constexpr int kMaxAtOnce = 2500;    // of them before the balance is searched in parts
+constexpr int kMaxAtOnce = 2500;    // of them before the balance is searched in rounds
 constexpr int kMaxOfPart = 8;       // models
+constexpr int kMaxRounds = 60;      // of bounds that stand still
+constexpr double kRoundAccuracy = 0.1;  // of what is left of the balance at its begin: to which a round is followed
+constexpr int kMaxDescent = 60;         // models of a round
+constexpr double kNearer = 0.1;         // of what was left before: where the balance is searched at once again
+constexpr int kMaxOfRound = 8, kMaxFactorsOfRound = 100;  // models and factorizations of that
 constexpr double kFirstPart = 0.25, kLeastPart = 1e-3;
 constexpr double kEnough = 1e-3;  // residual from which the next part goes on
 constexpr int kStandsStill = 3;   // models in balance without halving their motion
@@ -27,8 +32,9 @@ public:
 
     void run() {
         m_search.m_result.iterations = 0;
-        StepStatus status = search(m_search.m_options.max_iterations);
+        StepStatus status = search(m_search.m_options.max_iterations, kMaxAtOnce);
         if (status == StepStatus::blocked) return m_search.fail(status);
+        if (status != StepStatus::converged && m_least < kInfinity) status = search_in_rounds(status);
         if (status != StepStatus::converged && m_least < kInfinity && !is_driven()) status = search_in_parts(status);
         if (status != StepStatus::converged) fail(status);
     }
@@ -45,7 +51,8 @@ private:
     bool is_held() const { return !m_held.bodies.empty() || !m_held.nodes.empty(); }
 
     /// From where the point is.
-    StepStatus search(int max_iterations) {
+    StepStatus search(int max_iterations, int max_factors) {
+        max_factors += m_factors;
         m_damped = m_still = 0;
         m_least_motion = kInfinity;
         for (int iterations = 0;; ++iterations, ++m_search.m_result.iterations) {
@@ -58,7 +65,7 @@ private:
             if (iterations == 0 && driven && !m_in_parts && rests(now)) return StepStatus::converged;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
             m_factors += way.newton_steps;
-            if (m_factors > (m_in_parts || is_driven() ? kMaxFactors : kMaxAtOnce)) return StepStatus::crawls;
+            if (m_factors > (driven ? std::min(max_factors, kMaxFactors) : kMaxFactors)) return StepStatus::crawls;
             if (!way.found) return StepStatus::no_descent;
             const double motion = motion_to_end();
             const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
@@ -76,6 +83,55 @@ private:
             }
             if (now.residual > kSettled && rises(step)) continue;
             m_damped = 0;
+            m_search.accept_trial();
+            m_model.relax();
+        }
+    }
+
+    /// With bounds of friction that stand still, then follow, and stand still again. In between the balance is where
+    /// an energy is least, which damping finds from anywhere, across contacts that turn and cloth that buckles. Near
+    /// the balance it is searched at once again.
+    StepStatus search_in_rounds(StepStatus status) {
+        go_to(m_best);
+        double near = kSettled;
+        for (int round = 0; round < kMaxRounds; ++round) {
+            const double left = look().residual;
+            if (left < near) {
+                near = kNearer * left;
+                const Start here = {m_work.point.y, {}, m_model.memory()};
+                status = search(kMaxOfRound, kMaxFactorsOfRound);
+                if (status == StepStatus::converged) return status;
+                go_to(here.y);
+                m_model.recall(here.contacts);
+            }
+            if (m_factors > kMaxFactors) break;
+            m_model.stop_bounds(left < m_wanted ? kHoldingShare : left < kSettled ? kSlipShare : kColdShare);
+            m_model.forget_damping();
+            descend();
+            m_model.let_bounds_follow();
+        }
+        return status;
+    }
+
+    /// To where the energy with bounds that stand still is least, as nearly as the next bounds need.
+    void descend() {
+        double first = 1.0;
+        for (int models = 0; models < kMaxDescent; ++models) {
+            if (m_search.m_options.interrupt != nullptr) m_search.m_options.interrupt->throw_if_asked();
+            const Accuracy now = look(true);
+            if (models == 0) first = std::min(1.0, now.residual);
+            if (models > 0 && now.residual < std::max(m_wanted, kRoundAccuracy * first)) return;
+            const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, true, m_work.y_end);
+            m_factors += way.newton_steps;
+            if (!way.found) return;
+            const double step = m_search.m_path.covered_step(m_work.y_end, way.free);
+            m_search.m_path.set_trial(m_work.y_end, step);
+            evaluate(zone(), m_work.trial, &m_work.point);
+            const double change = m_work.trial.energy - m_work.point.energy + m_model.friction_work(step);
+            if (change > m_search.current_noise()) {
+                m_model.damp(m_work.trial, change);
+                continue;
+            }
             m_search.accept_trial();
             m_model.relax();
         }
@@ -117,11 +173,11 @@ private:
     StepStatus search_part(bool is_last) {
         const int most = m_search.m_options.max_iterations;
         m_is_rough = true;
-        const StepStatus status = search(std::min(kMaxOfPart, most));
+        const StepStatus status = search(std::min(kMaxOfPart, most), kMaxFactors);
         m_is_rough = false;
         if (!is_last || status != StepStatus::converged) return status;
         m_held = {};
-        return search(most);
+        return search(most, kMaxFactors);
     }
 
     void go_to(Coordinates y) {
@@ -134,7 +190,7 @@ private:
     }
 
     /// What is left of the balance at the point, and what that asks of the next model.
-    Accuracy look() {
+    Accuracy look(bool bounds_stand_still = false) {
         differentiate(zone(), m_work.point, Curvature::none, m_work.derivatives, nullptr);
         add(-1.0, m_held, m_work.derivatives.gradient);
         m_balance = m_work.derivatives.gradient;
@@ -145,8 +201,8 @@ private:
         m_wanted = std::max(m_search.m_options.tolerance, now.floor);
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
         m_model.aim_for(
-            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning, now.residual < m_wanted,
-             !m_in_parts});
+            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning && !bounds_stand_still,
+             now.residual < m_wanted, !m_in_parts, bounds_stand_still});
         return now;
     }
 

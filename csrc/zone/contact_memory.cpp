@@ -1,16 +1,11 @@
 #include "zone/contact_memory.hpp"
 
 #include <algorithm>
-#include <tuple>
 
 namespace diffsim {
 namespace {
 
-bool before(const ShiftedContact& one, const ShiftedContact& other) {
-    const Contact &c = one.contact, &d = other.contact;
-    return std::tie(c.object_a, c.object_b, c.type, c.feature_a, c.feature_b) <
-           std::tie(d.object_a, d.object_b, d.type, d.feature_a, d.feature_b);
-}
+bool before(const ShiftedContact& one, const ShiftedContact& other) { return comes_before(one.contact, other.contact); }
 
 }  // namespace
 

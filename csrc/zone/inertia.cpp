@@ -56,19 +56,4 @@ void add_inertia(const Zone& zone, const ZonePoint& point, ZoneDerivatives& deri
     }
 }
 
-void add_mass_matrix(const Zone& zone, double factor, BlockSystem& system) {
-    for (int i = 0; i < zone.dynamic_count; ++i) {
-        system.diagonal(i).topLeftCorner<3, 3>() += factor * zone.bodies[i].inertia;
-        system.diagonal(i).diagonal().tail<3>().array() += factor * zone.bodies[i].mass;
-    }
-    for (int i = 0; i < zone.node_count(); ++i)
-        if (!zone.nodes[i].pinned) system.node_diagonal(i).diagonal().array() += factor * zone.nodes[i].mass;
-}
-
-void add_mass_product(const Zone& zone, double factor, const Coordinates& x, Coordinates& sum) {
-    for (int i = 0; i < zone.dynamic_count; ++i) sum.bodies[i] += factor * mass_times(zone.bodies[i], x.bodies[i]);
-    for (int i = 0; i < zone.node_count(); ++i)
-        if (!zone.nodes[i].pinned) sum.nodes[i] += factor * zone.nodes[i].mass * x.nodes[i];
-}
-
 }  // namespace diffsim

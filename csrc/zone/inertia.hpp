@@ -11,10 +11,4 @@ double inertial_energy(const Zone& zone, const Coordinates& y);
 /// balance, and its size is noted. Pinned nodes have no gradient, and rows of the unit matrix.
 void add_inertia(const Zone& zone, const ZonePoint& point, ZoneDerivatives& derivatives, BlockSystem* system);
 
-/// system += factor * M, but for pinned nodes.
-void add_mass_matrix(const Zone& zone, double factor, BlockSystem& system);
-
-/// sum += factor * M x, but for pinned nodes.
-void add_mass_product(const Zone& zone, double factor, const Coordinates& x, Coordinates& sum);
-
 }  // namespace diffsim

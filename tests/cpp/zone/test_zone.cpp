@@ -7,7 +7,6 @@
 #include "zone/chart.hpp"
 #include "zone/contact_row.hpp"
 #include "zone/contacts.hpp"
-#include "zone/inertia.hpp"
 
 namespace test_zone {
 
@@ -308,15 +307,6 @@ TEST(energy_without_contact_is_inertial) {
     CHECK_NEAR(point.energy, 0.5 * error.dot(mass_matrix(zone) * error), 1e-13 * point.energy);
     CHECK(point.contact_energy == 0.0);
     CHECK_NEAR(derivatives_at(zone, point, Curvature::full).gradient, mass_matrix(zone) * error, 1e-13 * point.energy);
-
-    BlockSystem system;
-    system.set_pattern(base_pattern(zone));
-    system.set_zero();
-    add_mass_matrix(zone, 0.5, system);
-    CHECK_NEAR(dense(system), 0.5 * mass_matrix(zone), 1e-13);
-    Coordinates product = unflatten(error, 3);
-    add_mass_product(zone, 2.0, unflatten(error, 3), product);
-    CHECK_NEAR(flatten(product), error + 2.0 * (mass_matrix(zone) * error), 1e-13 * point.energy);
 }
 
 }  // namespace test_zone
