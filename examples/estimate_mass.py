@@ -5,7 +5,7 @@ together. The first has mass m1, the other 1 kg; the total momentum after 0.4 s 
 descent on the squared difference begins at m1 = 1 kg, and every gradient comes through the collision. Momentum is
 conserved, so that m1 v - v = 3: m1 = 1 + 3/v, and the momentum's derivative with respect to m1 is v whatever the
 collision does to either cube. At v = 1 m/s that is 4 kg. The published 5.4 kg is the answer of a simulator that damps
-every velocity; this one conserves.
+every velocity; this one conserves. Nothing here is random: the curve is one descent, and has no seeds.
 
 **The recording.** A box of unknown mass and inertia is pushed and twisted by known forces and torques, and falls on a
 sheet pinned at its corners, of unknown stretch stiffness, on which it slides with unknown friction. Four corners of the
@@ -22,7 +22,6 @@ Writes out/estimate_mass.png and .json and checks itself: the exit code says whe
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -33,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _stage import make_parser, needed, report, save_figure
+from _stage import make_parser, needed, report, save_figure, save_results
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 from tqdm import tqdm
@@ -340,7 +339,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "inside": dict(zip(NAMES, coverage.inside.tolist())),
             "draws": coverage.draws,
         }
-        (options.out / "estimate_mass.json").write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+        save_results(options.out / "estimate_mass.json", results)
     passed = check(descent, recording, fitted, coverage)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1
