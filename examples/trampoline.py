@@ -198,14 +198,13 @@ def fall_in_mujoco(name: str, xml: str, dt: float, speed: float, duration: float
 
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    ball = model.body("ball").id
-    data.qvel[model.body_dofadr[ball] + 2] = -speed
-    mujoco.mj_forward(model, data)
-    heights = [float(data.xpos[ball, 2])]
+    ball = data.joint(model.body("ball").jntadr[0])
+    ball.qvel[2] = -speed
+    heights = [float(ball.qpos[2])]  # xpos is of the step's start
     begin = time.perf_counter()
     for _ in range(round(duration / dt)):
         mujoco.mj_step(model, data)
-        heights.append(float(data.xpos[ball, 2]))
+        heights.append(float(ball.qpos[2]))
     seconds = time.perf_counter() - begin
     if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:  # MuJoCo starts again from the beginning there
         raise RuntimeError(f"{name}: MuJoCo became unstable")
