@@ -355,7 +355,7 @@ def draw_curves(axes: Any, learning: Learning, over_seconds: bool) -> None:
 
 def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], None]) -> None:
     def fill(figure: Any) -> None:
-        scene, episodes, seconds = figure.subplots(1, 3, width_ratios=(1.3, 1.0, 1.0))
+        scene, episodes, seconds = figure.subplots(1, 3, width_ratios=(1.6, 1.0, 1.0))
         draw_scene(scene)
         for axes, over_seconds, label in ((episodes, False, "episodes"), (seconds, True, "seconds of the processor")):
             for learning in learnings:
@@ -366,7 +366,7 @@ def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], 
         episodes.legend(frameon=False)
         seconds.set_title("mean and standard deviation", fontsize=10, color="0.2")
 
-    save_figure(path, fill, figsize=(13.0, 4.2))
+    save_figure(path, fill, figsize=(13.8, 4.2))
 
 
 # ---- the program of both ---------------------------------------------------------------------------------------------

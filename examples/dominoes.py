@@ -266,6 +266,9 @@ def draw(run: Run, path: Path) -> None:
         import matplotlib
 
         camera, colormap = Camera(-52.0, 34.0), matplotlib.colormaps["YlOrRd"]
+        meshes = [run.sim.mesh(run.states[step], body) for step, _ in shown for body in run.dominoes]
+        places = np.concatenate([camera.project(mesh.vertices)[:, :2] for mesh in meshes])
+        low, high = places.min(axis=0) - 0.06, places.max(axis=0) + 0.06
         grids = figure.subplots(2, 2)
         for axes, (step, title) in zip(grids.flat, shown):
             items = []
@@ -277,10 +280,10 @@ def draw(run: Run, path: Path) -> None:
             sheet = run.sim.mesh(run.states[step], len(run.sim.body_names))
             items.append(Item(sheet, (0.45, 0.62, 0.80), two_sided=True, edges=True))
             draw_items(axes, items, camera)
-            axes.set(xlim=(-0.35, 0.72), ylim=(-0.16, 0.52))
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             axes.set_title(f"{title}, t = {step * dt:.2f} s", fontsize=10, color="0.2")
 
-    save_figure(path, fill, figsize=(11.0, 7.4))
+    save_figure(path, fill, figsize=(10.2, 7.7))
 
 
 def summary(run: Run) -> dict[str, Any]:
