@@ -191,7 +191,7 @@ PARTS = {  # what each checks
     "balance_ball": 5,
     "card_house": 11,
     "dominoes": 8,
-    "estimate_mass": 7,
+    "estimate_mass": 8,
     "hanging_cloth": 10,
     "learn_cloth": 7,
     "learn_sticks": 6,
