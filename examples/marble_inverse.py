@@ -33,7 +33,6 @@ from _stage import (
     draw_band,
     make_parser,
     needed,
-    of_seeds,
     report,
     save_figure,
     save_results,
@@ -305,6 +304,7 @@ def draw(table: Table, trials: Sequence[Trial], path: Path) -> None:
             axes.tick_params(axis="x", which="minor", labelbottom=False)
         middle.set_ylabel("objective [m²], mean ± one standard deviation")
         middle.legend(frameon=False, fontsize=9, loc="center")
+        middle.set_title(f"{len(trials)} targets, one of each seed", fontsize=10, color="0.2")
 
     save_figure(path, fill, figsize=(13.0, 4.2))
 
@@ -325,9 +325,7 @@ def curve(axes: Any, searches: Sequence[Search], color: str, over_seconds: bool)
     length = min(len(s.objectives) for s in searches)
     falling = np.array([s.falling[:length] for s in searches])
     x = np.mean([s.seconds[:length] for s in searches], axis=0) if over_seconds else np.arange(1, length + 1)
-    draw_band(
-        axes, x, falling, color, marker="." if length < 30 else "", label=of_seeds(searches[0].name, len(searches))
-    )
+    draw_band(axes, x, falling, color, marker="." if length < 30 else "", label=searches[0].name)
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
