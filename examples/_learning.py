@@ -9,7 +9,6 @@ would need many more episodes than either gets here.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +17,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, needed, of_seeds, present, save_figure, weight_errors
+from _stage import (
+    FloatArray,
+    draw_band,
+    make_parser,
+    needed,
+    of_seeds,
+    present,
+    save_figure,
+    save_results,
+    weight_errors,
+)
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -336,18 +345,17 @@ def draw_curves(axes: Any, learning: Learning, over_seconds: bool) -> None:
     """Mean over seeds and one standard deviation to both sides."""
     kernel = np.ones(AVERAGE) / AVERAGE
     smooth = [np.convolve(c.left, kernel, mode="valid") for c in learning.curves]
-    values, color = 100.0 * np.array(smooth), COLORS[learning.name]
+    values = 100.0 * np.array(smooth)
     x = np.arange(AVERAGE, AVERAGE + values.shape[1], dtype=float)
     if over_seconds:
         x = np.mean([c.seconds for c in learning.curves], axis=0)[AVERAGE - 1 :]
-    mean, deviation = values.mean(axis=0), values.std(axis=0)
-    axes.plot(x, mean, color=color, lw=1.8, label=of_seeds(learning.name, len(learning.curves)))
-    axes.fill_between(x, np.maximum(mean - deviation, 0.05), mean + deviation, color=color, alpha=0.2, lw=0.0)
+    label = of_seeds(learning.name, len(learning.curves))
+    draw_band(axes, x, values, COLORS[learning.name], lw=1.8, label=label)
 
 
 def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], None]) -> None:
     def fill(figure: Any) -> None:
-        scene, episodes, seconds = figure.subplots(1, 3, width_ratios=(1.3, 1.0, 1.0))
+        scene, episodes, seconds = figure.subplots(1, 3, width_ratios=(1.6, 1.0, 1.0))
         draw_scene(scene)
         for axes, over_seconds, label in ((episodes, False, "episodes"), (seconds, True, "seconds of the processor")):
             for learning in learnings:
@@ -358,7 +366,7 @@ def draw(learnings: Sequence[Learning], path: Path, draw_scene: Callable[[Any], 
         episodes.legend(frameon=False)
         seconds.set_title("mean and standard deviation", fontsize=10, color="0.2")
 
-    save_figure(path, fill, figsize=(13.0, 4.2))
+    save_figure(path, fill, figsize=(13.8, 4.2))
 
 
 # ---- the program of both ---------------------------------------------------------------------------------------------
@@ -401,7 +409,7 @@ class Program:
         if not options.no_picture:
             learnings = [ours] if ddpg is None else [ours, ddpg]
             draw(learnings, options.out / f"{self.name}.png", lambda axes: draw_scene(axes, task, ours))
-            (options.out / f"{self.name}.json").write_text(json.dumps(summary(learnings)) + "\n")
+            save_results(options.out / f"{self.name}.json", summary(learnings))
         passed = check(task, left, ours, ddpg)
         print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
         return 0 if passed else 1

@@ -1,10 +1,11 @@
-"""What the examples share: figures to put into scenes, an independent judge of penetration, and pictures."""
+"""What the examples share: figures to put into scenes, an independent judge of penetration, results and pictures."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
 import importlib.util
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ def make_parser(description: str | None, quick: str, seed: str) -> argparse.Argu
     parser.add_argument("--seed", type=int, default=0, help=f"{seed} (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help=quick)
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results (default: %(default)s)")
-    parser.add_argument("--no-picture", action="store_true")
+    parser.add_argument("--no-picture", action="store_true", help="write neither the picture nor the result")
     return parser
 
 
@@ -187,7 +188,32 @@ def point_triangle_distance(point: FloatArray, triangles: FloatArray) -> FloatAr
     return np.asarray(np.where(inside, np.abs(((point - a) * normal).sum(1)), np.min(to_edges, axis=0)))
 
 
-# ---- pictures --------------------------------------------------------------------------------------------------------
+# ---- results and pictures --------------------------------------------------------------------------------------------
+
+
+def save_results(path: Path, results: Mapping[str, Any]) -> None:
+    """Write what was found, as JSON: a line for each name. Arrays and tensors become lists."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write = json.JSONEncoder(ensure_ascii=False, default=lambda array: array.tolist()).encode
+    lines = (f" {write(name)}: {write(value)}" for name, value in results.items())
+    path.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    print(f"result: {path}")
+
+
+def draw_band(axes: Any, x: Any, values: Any, color: str, log: bool = True, **line: Any) -> None:
+    """Mean over seeds, the rows of `values`, and one standard deviation to both sides; where the axis is logarithmic,
+    down to a fifth of the mean at most.
+    """
+    mean, deviation = np.mean(values, axis=0), np.std(values, axis=0)
+    low = np.maximum(mean - deviation, 0.2 * mean) if log else mean - deviation
+    axes.plot(x, mean, color=color, **line)
+    axes.fill_between(x, low, mean + deviation, color=color, alpha=0.2, lw=0.0)
+
+
+def continued(rows: Sequence[Sequence[float]]) -> FloatArray:
+    """Searches of different lengths as one array: who has arrived stays there."""
+    longest = max(map(len, rows))
+    return np.array([[*row, *[row[-1]] * (longest - len(row))] for row in rows])
 
 
 def of_seeds(name: str, count: int) -> str:

@@ -15,13 +15,12 @@ the same `Task`, by `ds.interop.gymnasium.VectorEnv`, and sees rewards only.
 What is compared is how far the ball is from the target in the last half second of 64 episodes that start elsewhere, by
 steps of the environment and by seconds of the processor. PPO gets four times as many steps.
 
-Writes out/balance_ball.png and .csv and checks itself: the exit code says whether all that `check` looks at holds.
+Writes out/balance_ball.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
 Without stable-baselines3 (`pip install "mesh-diffsim[rl]"`) PPO is left out, and the program says so.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 import sys
 import time
@@ -32,7 +31,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, make_parser, needed, of_seeds, present, report, save_figure
+from _stage import FloatArray, draw_band, make_parser, needed, of_seeds, present, report, save_figure, save_results
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -401,9 +400,7 @@ def draw_curves(axes: Any, curves: Sequence[Curve], over: str) -> None:
     """Mean and standard deviation over seeds; tests come after the same numbers of steps."""
     held = 1e3 * np.array([c.held for c in curves])
     x = np.mean([getattr(c, over) for c in curves], axis=0)
-    mean, deviation, color = held.mean(axis=0), held.std(axis=0), COLORS[curves[0].name]
-    axes.plot(x, mean, color=color, lw=1.8, label=of_seeds(curves[0].name, len(curves)))
-    axes.fill_between(x, np.maximum(mean - deviation, 1.0), mean + deviation, color=color, alpha=0.2, lw=0.0)
+    draw_band(axes, x, held, COLORS[curves[0].name], lw=1.8, label=of_seeds(curves[0].name, len(curves)))
 
 
 def draw(task: Task, actor: Actor, groups: Sequence[Sequence[Curve]], path: Path) -> None:
@@ -436,13 +433,20 @@ def draw(task: Task, actor: Actor, groups: Sequence[Sequence[Curve]], path: Path
     save_figure(path, fill, figsize=(13.0, 4.2))
 
 
-def write_csv(groups: Sequence[Sequence[Curve]], path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("algorithm", "seed", "steps", "processor_seconds", "held_m"))
-        for curve in (c for curves in groups for c in curves):
-            rows = zip(curve.steps, curve.seconds, curve.held)
-            writer.writerows((curve.name, curve.seed, n, f"{s:.3f}", f"{h:.6f}") for n, s, h in rows)
+def summary(groups: Sequence[Sequence[Curve]]) -> dict[str, Any]:
+    """For a file of results."""
+    return {
+        curves[0].name: [
+            {
+                "seed": c.seed,
+                "steps": c.steps,
+                "seconds": [round(x, 3) for x in c.seconds],
+                "held [m]": [round(x, 6) for x in c.held],
+            }
+            for c in curves
+        ]
+        for curves in groups
+    }
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
@@ -465,7 +469,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not options.no_picture:
         groups = [ours, ppo] if ppo else [ours]
         draw(task, trained[0][1], groups, options.out / "balance_ball.png")
-        write_csv(groups, options.out / "balance_ball.csv")
+        save_results(options.out / "balance_ball.json", summary(groups))
     passed = check(task, ours, ppo, trained[0][1:3], sum(failed for *_, failed in trained))
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

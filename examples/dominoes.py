@@ -13,7 +13,7 @@ With friction, `--friction 0.3`, there are no sills, and all fall one after the 
 last comes to the cloth is told, not asked for. The cloth stays smooth: one with friction takes hold of the domino's
 face as it comes down on it, and the domino keeps standing.
 
-Writes out/dominoes.png and checks itself: the exit code says whether all that `check` looks at holds.
+Writes out/dominoes.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, make_parser, report, save_figure, shift, weight_errors
+from _stage import FloatArray, Judge, make_parser, report, save_figure, save_results, shift, weight_errors
 from tqdm import tqdm
 
 import diffsim as ds
@@ -266,6 +266,9 @@ def draw(run: Run, path: Path) -> None:
         import matplotlib
 
         camera, colormap = Camera(-52.0, 34.0), matplotlib.colormaps["YlOrRd"]
+        meshes = [run.sim.mesh(run.states[step], body) for step, _ in shown for body in run.dominoes]
+        places = np.concatenate([camera.project(mesh.vertices)[:, :2] for mesh in meshes])
+        low, high = places.min(axis=0) - 0.06, places.max(axis=0) + 0.06
         grids = figure.subplots(2, 2)
         for axes, (step, title) in zip(grids.flat, shown):
             items = []
@@ -277,10 +280,27 @@ def draw(run: Run, path: Path) -> None:
             sheet = run.sim.mesh(run.states[step], len(run.sim.body_names))
             items.append(Item(sheet, (0.45, 0.62, 0.80), two_sided=True, edges=True))
             draw_items(axes, items, camera)
-            axes.set(xlim=(-0.35, 0.72), ylim=(-0.16, 0.52))
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             axes.set_title(f"{title}, t = {step * dt:.2f} s", fontsize=10, color="0.2")
 
-    save_figure(path, fill, figsize=(11.0, 7.4))
+    save_figure(path, fill, figsize=(10.2, 7.7))
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """For a file of results."""
+    happened = events(run)
+
+    def when(step: int | None) -> float | None:
+        return None if step is None else round(step * run.sim.dt, 6)
+
+    return {
+        "dt [s]": run.sim.dt,
+        "the cloth strikes [s]": when(happened.strike),
+        "dominoes fall [s]": [when(step) for step in happened.toppled],
+        "the last comes to the cloth [s]": when(happened.push),
+        "energies [J]": run.energies,
+        "steps that did not converge": run.failed,
+    }
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
@@ -301,6 +321,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{len(run.sim.body_names)} bodies, {1e3 * run.seconds / (len(run.states) - 1):.1f} ms per step")
     if not options.no_picture:
         draw(run, options.out / "dominoes.png")
+        save_results(options.out / "dominoes.json", summary(run))
     passed = check(run, comes_around=options.friction == 0.0)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

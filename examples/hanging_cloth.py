@@ -5,13 +5,14 @@ further down its weight stretches it. Its nodes are observed with 1 mm of noise.
 large and a bend stiffness eight times too small, L-BFGS follows the gradient that comes back through the simulator;
 CMA-ES (`cma`) gets the same number of simulations. Both see the same loss: the sum of squared distances from the
 observed nodes, in units of the noise; and the same two unknowns, logarithms of the stiffnesses squeezed into a range of
-plausible ones.
+plausible ones. All is done for five draws of the noise, with five seeds of CMA-ES.
 
 To find the resting shape the strip is let go and a few steps of three seconds are taken: implicit Euler with such
 steps is a relaxation. A simulation starts from the rest shape of the first guess.
 
-Writes out/hanging_cloth.png and checks itself: the exit code says whether all that `check` looks at holds. The resting
-shape is judged by the elastica: stiffnesses read off it by the balance of forces and moments, without the simulator.
+Writes out/hanging_cloth.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
+The resting shape is judged by the elastica: stiffnesses read off it by the balance of forces and moments, without the
+simulator.
 """
 
 from __future__ import annotations
@@ -26,7 +27,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, make_parser, needed, report, save_figure
+from _stage import (
+    FloatArray,
+    Judge,
+    continued,
+    draw_band,
+    make_parser,
+    needed,
+    of_seeds,
+    report,
+    save_figure,
+    save_results,
+)
 from torch import Tensor
 from tqdm import tqdm
 
@@ -47,6 +59,7 @@ STEPS = 5  # of a simulation
 RELAX = 8  # steps, to find the rest shape of the first guess from the flat strip
 RANGE = 30.0  # stiffnesses are looked for from the guess's 30th part to 30 times the guess
 BUDGET = 24  # simulations for each method
+SEEDS = 5  # by default
 
 RESTING = 1e-5  # largest speed of a node at the end [m/s]
 GRADIENT_ERROR = 1e-5  # against central differences, relative
@@ -194,6 +207,32 @@ def by_cma(problem: Problem, budget: int, tell: Callable[[], object], seed: int 
     return search
 
 
+@dataclass
+class Trial:
+    """One draw of the noise, and what the searches made of it."""
+
+    seed: int
+    problem: Problem
+    gradient: Search
+    evolution: Search
+
+    @property
+    def lead(self) -> tuple[float, float]:
+        """How far the least loss of each search is above the lower of both."""
+        ours, theirs = min(self.gradient.losses), min(self.evolution.losses)
+        return ours - min(ours, theirs), theirs - min(ours, theirs)
+
+
+def run_trials(strip: Strip, seeds: Sequence[int], budget: int) -> list[Trial]:
+    trials = []
+    with tqdm(total=2 * budget * len(seeds), desc="simulations", unit="run") as bar:
+        for seed in seeds:
+            problem = observe(strip, TRUTH, seed)
+            gradient = by_gradient(problem, budget, bar.update)
+            trials.append(Trial(seed, problem, gradient, by_cma(problem, budget, bar.update, seed + 1)))
+    return trials
+
+
 # ---- checks ----------------------------------------------------------------------------------------------------------
 
 
@@ -241,9 +280,10 @@ def standard_errors(problem: Problem, logs: Tensor, step: float = 1e-4) -> tuple
     return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))), 2.0 * jacobian.T @ residual
 
 
-def check(problem: Problem, gradient: Search, evolution: Search) -> bool:
+def check(trials: Sequence[Trial]) -> bool:
     """Print what must hold and whether it does."""
-    strip, results = problem.strip, list[tuple[str, bool]]()
+    problem, results = trials[0].problem, list[tuple[str, bool]]()
+    strip = problem.strip
     guess, truth = (torch.log(torch.tensor(x, dtype=torch.float64)) for x in (GUESS, TRUTH))
 
     resting = strip.run(truth)
@@ -262,23 +302,24 @@ def check(problem: Problem, gradient: Search, evolution: Search) -> bool:
     off = float(np.abs(exact.numpy() - differences).max() / np.abs(differences).max())
     results.append((f"gradient at the guess: {off:.1e} from central differences, relative", off < GRADIENT_ERROR))
 
-    errors, _ = standard_errors(problem, gradient.best)
-    for k, name in enumerate(("stretch", "bend")):
-        found, true = gradient.values[k], TRUTH[k]
-        off = abs(float(gradient.best[k] - truth[k])) / errors[k]
-        text = f"{name} found: {found:.4g}, {100.0 * (found / true - 1.0):+.2f} % from the truth, {off:.1f} times what"
-        results.append((f"{text} the noise makes of it (at most {ERRORS:g})", off <= ERRORS))
-    per_number = min(gradient.losses) / problem.freedom
-    spread = 4.0 * (2.0 / problem.freedom) ** 0.5
-    results.append(
-        (f"what is left is noise: loss {per_number:.3f} per observed number", abs(per_number - 1.0) < spread)
+    offs = np.array(
+        [(t.gradient.best - truth).numpy() / standard_errors(t.problem, t.gradient.best)[0] for t in trials]
     )
+    for k, name in enumerate(("stretch", "bend")):
+        listed = ", ".join(f"{100.0 * (t.gradient.values[k] / TRUTH[k] - 1.0):+.2f}" for t in trials)
+        off = float(np.abs(offs[:, k]).max())
+        text = f"{name} found: {listed} % from the truth, at most {off:.1f} times what the noise makes of it"
+        results.append((f"{text} (at most {ERRORS:g})", off <= ERRORS))
+    per_number = np.array([min(t.gradient.losses) for t in trials]) / problem.freedom
+    listed, spread = ", ".join(f"{x:.3f}" for x in per_number), 4.0 * (2.0 / problem.freedom) ** 0.5
+    text = f"what is left is noise: loss {listed} per observed number (1 ± {spread:.3f})"
+    results.append((text, bool((np.abs(per_number - 1.0) < spread).all())))
 
-    lowest = min(min(gradient.losses), min(evolution.losses))
-    ours, theirs = (min(s.losses) - lowest for s in (gradient, evolution))
-    text = f"after {len(gradient.losses)} simulations L-BFGS is {ours:.2g} over the best loss, CMA-ES {theirs:.2g}"
-    results.append((f"{text} after {len(evolution.losses)}", ours <= EXCESS * theirs))
-    crossings = Judge(strip.scene, strip.sim).count(strip.run(gradient.best).detach())
+    times = [min(t.evolution.losses) / min(t.gradient.losses) for t in trials]
+    text = f"after {len(trials[0].evolution.losses)} simulations CMA-ES is {min(times):.2g} to {max(times):.2g} times"
+    text += f" above L-BFGS after at most {max(len(t.gradient.losses) for t in trials)}"
+    results.append((text, all(ours <= EXCESS * theirs for ours, theirs in (t.lead for t in trials))))
+    crossings = Judge(strip.scene, strip.sim).count(strip.run(trials[0].gradient.best).detach())
     text = "the strip does not cross itself (ipctk)" + "".join(f"; {crossing}" for crossing in crossings[:3])
     results.append((text, not crossings))
     results.append((f"{strip.failed_steps} steps did not converge, of all simulations", strip.failed_steps == 0))
@@ -288,49 +329,60 @@ def check(problem: Problem, gradient: Search, evolution: Search) -> bool:
 # ---- picture ---------------------------------------------------------------------------------------------------------
 
 
-def draw(problem: Problem, searches: Sequence[Search], path: Path) -> None:
+def draw(trials: Sequence[Trial], path: Path) -> None:
+    problem = trials[0].problem
     strip = problem.strip
     guess = torch.log(torch.tensor(GUESS, dtype=torch.float64))
 
     def fill(figure: Any) -> None:
-        left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-        camera = Camera(-78.0, 12.0)
+        left, right = figure.subplots(1, 2, width_ratios=(0.7, 1.5))
+        camera = Camera(-50.0, 16.0)
         items = []
-        for logs, color in ((guess, (0.80, 0.80, 0.82)), (searches[0].best, (0.50, 0.66, 0.80))):
+        for logs, color in ((guess, (0.80, 0.80, 0.82)), (trials[0].gradient.best, (0.50, 0.66, 0.80))):
             mesh = strip.sim.mesh(strip.run(logs)[-1].detach(), 0)
             items.append(Item(mesh, color, alpha=0.9, two_sided=True, edges=True))
         draw_items(left, items, camera, shadows=False)
         dots = camera.project(problem.observed.numpy())
         left.plot(dots[:, 0], dots[:, 1], ".", ms=2.5, color="#b3261e", zorder=5)
         left.set_title("grey: the guess; blue: found; red: observed", fontsize=10, color="0.2")
-        floor = min(min(s.losses) for s in searches)
-        for search, line in zip(searches, ("#1f5fa8", "#d9601a")):
-            count = np.arange(1, len(search.losses) + 1)
-            right.plot(count, np.array(search.losses) / problem.freedom, ".", ms=5, color=line, alpha=0.5)
-            right.step(count, search.falling / problem.freedom, where="post", color=line, label=search.name)
-        right.axhline(floor / problem.freedom, color="0.7", lw=0.8, ls=":")
-        right.set(xlabel="simulations", ylabel="loss per observed number", yscale="log")
+        for searches, color in zip(zip(*((t.gradient, t.evolution) for t in trials)), ("#1f5fa8", "#d9601a")):
+            falling = continued([s.falling for s in searches]) / problem.freedom
+            count, name = np.arange(1, falling.shape[1] + 1), of_seeds(searches[0].name, len(searches))
+            draw_band(right, count, falling, color, marker=".", label=name)
+        right.axhline(1.0, color="0.7", lw=0.8, ls=":")
+        right.set(xlabel="simulations", ylabel="least loss so far, per observed number", yscale="log")
+        right.set_title("mean and standard deviation; dotted: the noise", fontsize=10, color="0.2")
         right.legend(frameon=False, fontsize=9)
 
     save_figure(path, fill, figsize=(10.5, 4.6))
+
+
+def summary(trials: Sequence[Trial]) -> dict[str, Any]:
+    """For a file of results."""
+    return {
+        searches[0].name: [
+            {"seed": t.seed, "losses": s.losses, "stretch [N/m] and bend [N·m]": s.values}
+            for t, s in zip(trials, searches)
+        ]
+        for searches in zip(*((t.gradient, t.evolution) for t in trials))
+    }
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = make_parser(__doc__, f"{QUICK_NODES[0]} x {QUICK_NODES[1]} nodes", "of the noise, and of CMA-ES")
+    quick = f"{QUICK_NODES[0]} x {QUICK_NODES[1]} nodes, one seed"
+    parser = make_parser(__doc__, quick, "of the noise, and of CMA-ES: the first")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="how many (default: %(default)s)")
     parser.add_argument("--budget", type=int, default=BUDGET, help="simulations of each method (default: %(default)s)")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     budget = options.budget
     strip = Strip(QUICK_NODES if options.quick else NODES)
-    problem = observe(strip, TRUTH, options.seed)
     print(f"{strip.nodes[0]} x {strip.nodes[1]} nodes, {STEPS} steps of {DT:g} s; {budget} simulations for each method")
-    with tqdm(total=2 * budget, desc="simulations", unit="run") as bar:
-        gradient = by_gradient(problem, budget, bar.update)
-        evolution = by_cma(problem, budget, bar.update, options.seed + 1)
-    for search in (gradient, evolution):
+    trials = run_trials(strip, range(options.seed, options.seed + (1 if options.quick else options.seeds)), budget)
+    for search in (s for t in trials for s in (t.gradient, t.evolution)):
         stretch, bend = search.values
         count = len(search.losses)
         seconds = f"{1e3 * search.forward_seconds / count:.0f} ms"
@@ -338,8 +390,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             seconds += f" + {1e3 * search.backward_seconds / count:.0f} ms backward"
         print(f"{search.name}: stretch {stretch:.4g} N/m, bend {bend:.4g} N·m, {seconds} per simulation")
     if not options.no_picture:
-        draw(problem, (gradient, evolution), options.out / "hanging_cloth.png")
-    passed = check(problem, gradient, evolution)
+        draw(trials, options.out / "hanging_cloth.png")
+        save_results(options.out / "hanging_cloth.json", summary(trials))
+    passed = check(trials)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1
 

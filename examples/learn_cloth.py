@@ -38,7 +38,7 @@ LOW, HIGH = 0.3, 0.55  # of the targets above the start [m]
 PROGRAM = Program("learn_cloth", __doc__, episodes=100, quick_episodes=100, rate=2e-3)
 REACH = 0.05  # of the distance that may be left
 GRADIENT_ERROR = 1e-4  # of an episode's gradient, relative
-APART = 1.3  # of the pictures of one motion [m]
+APART = 1.15  # of the pictures of one motion [m]
 
 
 # ---- task ------------------------------------------------------------------------------------------------------------

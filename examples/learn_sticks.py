@@ -36,7 +36,7 @@ DENSITY, GRAVITY = 10.0, 1.0  # of the block [kg/m³], [m/s²]
 SPEED = 5.0  # of a stick at most [m/s]
 SIDE, UP, SPREAD = 1.0, 2.0, 0.05  # of the targets [m]
 
-PROGRAM = Program("learn_sticks", __doc__, episodes=100, quick_episodes=60, rate=3e-3)
+PROGRAM = Program("learn_sticks", __doc__, episodes=100, quick_episodes=60, rate=2e-3)
 REACH = 0.05  # of the distance that may be left
 GRADIENT_ERROR = 1e-4  # of an episode's gradient, relative
 

@@ -5,7 +5,7 @@ upwards and inwards, gently at first and in the end, and then they are held. The
 closes around them and lifts them off the ground, in one problem with them at each step. Contact is frictionless: what
 holds them is the bag. `--friction 0.4` carries them as well.
 
-Writes out/lift_figurines.png and checks itself: the exit code says whether all that `check` looks at holds.
+Writes out/lift_figurines.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,17 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from _stage import FloatArray, Judge, load_figure, make_parser, report, save_figure, shift, weight_errors
+from _stage import (
+    FloatArray,
+    Judge,
+    load_figure,
+    make_parser,
+    report,
+    save_figure,
+    save_results,
+    shift,
+    weight_errors,
+)
 from torch import Tensor
 from tqdm import tqdm
 
@@ -227,6 +237,17 @@ def draw(run: Run, path: Path) -> None:
     save_figure(path, fill, figsize=(3.4 * len(shown), 3.5))
 
 
+def summary(run: Run) -> dict[str, Any]:
+    """For a file of results."""
+    places = torch.stack([state.position for state in run.states])
+    return {
+        "dt [s]": run.sim.dt,
+        "masses [kg]": dict(zip(run.sim.body_names, run.sim.mass.tolist())),
+        "centres of mass [m]": {name: places[:, body] for body, name in enumerate(run.sim.body_names)},
+        "steps that did not converge": run.failed,
+    }
+
+
 # ---- program ---------------------------------------------------------------------------------------------------------
 
 
@@ -246,6 +267,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{masses} on {nodes} x {nodes} nodes; {each:.0f} ms per step of {dt:g} s")
     if not options.no_picture:
         draw(run, options.out / "lift_figurines.png")
+        save_results(options.out / "lift_figurines.json", summary(run))
     passed = check(run)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

@@ -6,7 +6,7 @@ force that takes it to a target; the objective is the squared distance from ther
 
 Three searches from no force at all see the same objective: gradient descent with a constant step, L-BFGS, and CMA-ES
 (`cma`), which gets a hundred times as many simulations as descent has iterations. Each is run for a target from each
-seed: two by default, five by `--seeds 5`. (After Fig. 7 of Qiao et al., ICML 2020: the sheet's size, marble, gravity
+seed, five by default. (After Fig. 7 of Qiao et al., ICML 2020: the sheet's size, marble, gravity
 and time step are theirs. That marble, of 8 cm radius and 4.2 g, is as light as a toy balloon; their descent had
 momentum, which only delays it.)
 
@@ -16,7 +16,6 @@ Writes out/marble_inverse.png and .json and checks itself: the exit code says wh
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import sys
 import time
@@ -28,7 +27,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from _stage import FloatArray, Judge, make_parser, needed, report, save_figure, weight_errors
+from _stage import (
+    FloatArray,
+    Judge,
+    draw_band,
+    make_parser,
+    needed,
+    report,
+    save_figure,
+    save_results,
+    weight_errors,
+)
 from torch import Tensor
 from tqdm import tqdm
 
@@ -295,30 +304,28 @@ def draw(table: Table, trials: Sequence[Trial], path: Path) -> None:
             axes.tick_params(axis="x", which="minor", labelbottom=False)
         middle.set_ylabel("objective [m²], mean ± one standard deviation")
         middle.legend(frameon=False, fontsize=9, loc="center")
+        middle.set_title(f"{len(trials)} targets, one of each seed", fontsize=10, color="0.2")
 
     save_figure(path, fill, figsize=(13.0, 4.2))
 
 
-def summary(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """For a file of results: of each target what was searched, and the force of descent [N]."""
-    return [
-        {
-            "target": trial.problem.target.tolist(),
-            "force": (math.sqrt(STEP) * trial.descent.best).tolist(),
-            "searches": {s.name: {"objectives": s.objectives, "seconds": s.seconds} for s in trial.searches},
-        }
-        for trial in trials
-    ]
+def summary(trials: Sequence[Trial]) -> dict[str, Any]:
+    """For a file of results: the targets, the forces of descent, and what was searched for each."""
+    found: dict[str, Any] = {
+        "targets [m]": [trial.problem.target for trial in trials],
+        "forces [N]": [math.sqrt(STEP) * trial.descent.best for trial in trials],
+    }
+    for searches in zip(*(trial.searches for trial in trials)):
+        found[searches[0].name] = [{"objectives [m²]": s.objectives, "seconds": s.seconds} for s in searches]
+    return found
 
 
 def curve(axes: Any, searches: Sequence[Search], color: str, over_seconds: bool) -> None:
     """Mean and standard deviation of the least objective so far, over the targets."""
     length = min(len(s.objectives) for s in searches)
     falling = np.array([s.falling[:length] for s in searches])
-    mean, deviation = falling.mean(axis=0), falling.std(axis=0)
     x = np.mean([s.seconds[:length] for s in searches], axis=0) if over_seconds else np.arange(1, length + 1)
-    axes.plot(x, mean, color=color, marker="." if length < 30 else "", label=searches[0].name)
-    axes.fill_between(x, np.maximum(mean - deviation, 0.2 * mean), mean + deviation, color=color, alpha=0.2, lw=0)
+    draw_band(axes, x, falling, color, marker="." if length < 30 else "", label=searches[0].name)
 
 
 # ---- program ---------------------------------------------------------------------------------------------------------
@@ -341,7 +348,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{searches[0].name}: {spread} after {count} simulations, {seconds:.1f} s")
     if not options.no_picture:
         draw(table, trials, options.out / "marble_inverse.png")
-        (options.out / "marble_inverse.json").write_text(json.dumps(summary(trials)) + "\n")
+        save_results(options.out / "marble_inverse.json", summary(trials))
     passed = check(table, trials, options.iterations)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

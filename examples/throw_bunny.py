@@ -10,7 +10,7 @@ Contacts have kinks: a launch a little different strikes with another part of th
 steps the nearer it is, in proportion to the root of the distance that is left; where a step went badly wrong (the bunny
 ran into the ring, say) it returns to the best launch so far and goes on with half the rate.
 
-Writes out/throw_bunny.png and checks itself: the exit code says whether all that `check` looks at holds.
+Writes out/throw_bunny.png and .json and checks itself: the exit code says whether all that `check` looks at holds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import fcl
 import numpy as np
 import torch
 import trimesh
-from _stage import FloatArray, load_figure, make_parser, report, save_figure, shift
+from _stage import FloatArray, load_figure, make_parser, report, save_figure, save_results, shift
 from torch import Tensor
 from tqdm import tqdm
 
@@ -357,6 +357,15 @@ def draw(throw: Throw, search: Search, path: Path) -> None:
     save_figure(path, fill, figsize=(13.2, 4.9))
 
 
+def summary(throw: Throw, search: Search) -> dict[str, Any]:
+    """For a file of results."""
+    found: dict[str, Any] = {"squared distances [m²]": search.losses}
+    for name, shot in (("first", search.first), ("best", search.best)):
+        path = shot.trajectory.position[:, throw.bunny]
+        found[name] = {"velocity [m/s]": shot.velocity, "spin [rad/s]": shot.spin, "path [m]": path}
+    return found
+
+
 # ---- program ---------------------------------------------------------------------------------------------------------
 
 
@@ -378,6 +387,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{name} launch: velocity {velocity} m/s, spin {spin} rad/s, misses by {shot.millimetres:.1f} mm")
     if not options.no_picture:
         draw(throw, search, options.out / "throw_bunny.png")
+        save_results(options.out / "throw_bunny.json", summary(throw, search))
     passed = check(throw, search)
     print(f"{'passed' if passed else 'FAILED'} in {time.perf_counter() - begin:.0f} s")
     return 0 if passed else 1

@@ -5,9 +5,10 @@ sees the place and chooses the velocity of the striker; the loss is the squared 
 to the network through the collision. Network and simulator are one module, `Policy`, which
 `torch.nn.parallel.DistributedDataParallel` takes as it takes any other: every process plays its share of the scenes,
 one batch per call, and the gradients are averaged between processes (gloo). With plain python, one process plays them
-all, to the same result but for rounding.
+all, to the same result but for rounding. Five policies are trained, one after the other, from five seeds.
 
-Writes out/train_distributed.png and checks itself: the exit code says whether all that `check` looks at holds.
+Writes out/train_distributed.png and .json and checks itself: the exit code says whether all that `check` looks at
+holds.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed
-from _stage import make_parser, report, save_figure
+from _stage import draw_band, make_parser, of_seeds, report, save_figure, save_results
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
@@ -36,7 +38,7 @@ RADIUS, GAP = 0.05, 0.1  # of both balls; between them at first [m]
 SCENES = 32  # per iteration, over all processes
 TESTS = 64  # scenes no network was trained on
 NEAREST, FARTHEST, WIDEST = 0.3, 0.8, math.radians(25.0)  # where targets are, seen from the ball that is struck
-RATE, ITERATIONS, QUICK_ITERATIONS = 0.01, 300, 200
+RATE, ITERATIONS, QUICK_ITERATIONS, SEEDS = 0.01, 300, 200, 5
 
 FALL = 100.0  # the mean squared distance must fall by this
 HIT = 0.95  # part of the test scenes in which the ball must have been struck
@@ -83,12 +85,15 @@ class Policy(nn.Module):
             self.network[-1].bias.copy_(torch.tensor([1.5, 0.0]))  # straight ahead: who misses learns nothing
         self.sim = ds.Simulator(build_scene(), dt=DT)
         self.start = self.sim.initial_state()
+        self.failed_steps = 0
 
     def forward(self, target: Tensor) -> Tensor:
         seen = (target - target.new_tensor([0.5 * (NEAREST + FARTHEST), 0.0])) / (0.5 * (FARTHEST - NEAREST))
         launch = nn.functional.pad(self.network(seen), (0, 1))  # along the ground
         velocity = torch.stack([launch, torch.zeros_like(launch)], dim=1)
         trajectory = self.sim.rollout(self.start.replace(velocity=velocity), None, STEPS)
+        assert self.sim.info is not None
+        self.failed_steps += self.sim.info.failed_steps
         return trajectory.position[-1, :, 1, :2]
 
 
@@ -156,7 +161,7 @@ def train(share: Share, iterations: int, seed: int = 0) -> Training:
     optimiser = torch.optim.Adam(policy.network.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations)
     training = Training(policy, share, seed, torch.empty(0))
-    for iteration in tqdm(range(iterations), desc="training", unit="iteration", disable=share.rank > 0):
+    for iteration in tqdm(range(iterations), desc=f"training, seed {seed}", unit="iteration", disable=share.rank > 0):
         target = share.part(targets(SCENES, seed=first_scenes(seed) + iteration))
         optimiser.zero_grad()
         loss = squared_distance(module(target), target)
@@ -168,7 +173,7 @@ def train(share: Share, iterations: int, seed: int = 0) -> Training:
         training.losses.append(float(share.mean(loss)))
     if share.rank == 0:
         ends = (f"{loss**0.5:.4f} m" for loss in (training.losses[0], training.losses[-1]))
-        print(f"root of the mean squared distance: {' to '.join(ends)}")
+        print(f"seed {seed}, root of the mean squared distance: {' to '.join(ends)}")
     return training
 
 
@@ -216,26 +221,33 @@ def momentum_error(policy: Policy) -> float:
     return float((ends.sum(0) - launch[0]).norm() / launch[0].norm())
 
 
-def check(training: Training) -> bool:
+def spread_of_weights(training: Training) -> float:
+    """Between processes."""
+    weights = torch.cat([p.detach().flatten() for p in training.policy.network.parameters()])
+    return float((training.share.mean(weights) - weights).abs().max())
+
+
+def check(trainings: Sequence[Training]) -> bool:
     """True if all holds; every process has to call it."""
-    share, policy = training.share, training.policy
-    expected = reference_gradient(training.seed)
-    error = float((training.first_gradient - expected).norm() / expected.norm())
-    differences = gradient_error(training.seed)
-    changed = momentum_error(policy)
-    weights = torch.cat([p.detach().flatten() for p in policy.network.parameters()])
-    spread = float((share.mean(weights) - weights).abs().max())
-    (before, _), (after, struck) = evaluate(Policy(training.seed)), evaluate(policy)
-    info = policy.sim.info
-    assert info is not None
+    share, seeds = trainings[0].share, [t.seed for t in trainings]
+    expected = [reference_gradient(seed) for seed in seeds]
+    error = max(float((t.first_gradient - e).norm() / e.norm()) for t, e in zip(trainings, expected))
+    differences = max(map(gradient_error, seeds))
+    changed = momentum_error(trainings[0].policy)
+    spread = max(map(spread_of_weights, trainings))
+    before = [evaluate(Policy(seed))[0] for seed in seeds]
+    after, struck = zip(*(evaluate(t.policy) for t in trainings))
+    fell = [b / a for b, a in zip(before, after)]
+    failed = sum(t.policy.failed_steps for t in trainings)
+    listed, hit = ", ".join(f"{x:.0f}" for x in fell), ", ".join(f"{100.0 * x:.0f}" for x in struck)
     holds = [
         (f"gradient of {share.count} process(es) equals that of one to {error:.1e}", error <= SAME_GRADIENT),
         (f"and central differences to {differences:.1e}", differences <= GRADIENT_ERROR),
         (f"a strike keeps the momentum, to {changed:.1e}", changed <= MOMENTUM_ERROR),
         (f"processes have the same weights (spread {spread:.1e})", spread == 0.0),
-        (f"every step converged ({info.failed_steps} did not)", info.converged),
-        (f"{100.0 * struck:.0f} % of {TESTS} new balls were struck", struck >= HIT),
-        (f"mean squared distance to {TESTS} new targets fell {before / after:.0f} times", before >= FALL * after),
+        (f"every step converged ({failed} did not)", failed == 0),
+        (f"{hit} % of {TESTS} new balls were struck", min(struck) >= HIT),
+        (f"mean squared distance to {TESTS} new targets fell {listed} times", min(fell) >= FALL),
     ]
     return report(holds) if share.rank == 0 else all(holds for _, holds in holds)
 
@@ -243,16 +255,19 @@ def check(training: Training) -> bool:
 # ---- picture ---------------------------------------------------------------------------------------------------------
 
 
-def draw(training: Training, path: Path) -> None:
+def draw(trainings: Sequence[Training], path: Path) -> None:
     target = targets(TESTS, seed=-1)
     with torch.no_grad():
-        reached = training.policy(target)
+        reached = trainings[0].policy(target)
+    losses = np.sqrt([t.losses for t in trainings])
 
     def fill(figure: Any) -> None:
         left, right = figure.subplots(1, 2)
-        left.semilogy([loss**0.5 for loss in training.losses], color="0.25")
-        left.set(xlabel="iteration", ylabel="root of mean squared distance [m]")
+        label = of_seeds("mean and standard deviation", len(trainings))
+        draw_band(left, np.arange(losses.shape[1]), losses, "#1f5fa8", lw=1.2, label=label)
+        left.set(xlabel="iteration", ylabel="root of mean squared distance [m]", yscale="log")
         left.grid(True, alpha=0.3)
+        left.legend(frameon=False)
         right.plot(*target.T, "o", ms=9, mfc="none", mec="#0a7d33", label="target")
         right.plot(*reached.T, ".", ms=6, color="#b03a2e", label="ball")
         right.plot([0.0, -2.0 * RADIUS - GAP], [0.0, 0.0], "o", ms=12, color="0.7")
@@ -266,20 +281,24 @@ def draw(training: Training, path: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    quick = f"{QUICK_ITERATIONS} iterations"
-    parser = make_parser(__doc__, quick, "of the network and its scenes")
+    quick = f"one seed, {QUICK_ITERATIONS} iterations"
+    parser = make_parser(__doc__, quick, "of the network and its scenes: the first")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="how many (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=ITERATIONS, help="of training (default: %(default)s)")
     parser.add_argument("--gradient", type=Path, help="file for the gradient of the first iteration (torch.save)")
     options = parser.parse_args(argv)
     begin = time.perf_counter()
     with processes() as share:
         iterations = min(options.iterations, QUICK_ITERATIONS) if options.quick else options.iterations
-        training = train(share, iterations, options.seed)
+        seeds = range(options.seed, options.seed + (1 if options.quick else options.seeds))
+        trainings = [train(share, iterations, seed) for seed in seeds]
         if options.gradient is not None and share.rank == 0:
-            torch.save(training.first_gradient, options.gradient)
+            torch.save(trainings[0].first_gradient, options.gradient)
         if not options.no_picture and share.rank == 0:
-            draw(training, options.out / "train_distributed.png")
-        passed = check(training)
+            draw(trainings, options.out / "train_distributed.png")
+            results = {"seeds": list(seeds), "mean squared distances [m²]": [t.losses for t in trainings]}
+            save_results(options.out / "train_distributed.json", results)
+        passed = check(trainings)
         if share.rank == 0:
             verdict, seconds = "passed" if passed else "FAILED", time.perf_counter() - begin
             print(f"{verdict} in {seconds:.0f} s, {share.count} process(es)")

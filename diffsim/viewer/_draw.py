@@ -23,6 +23,8 @@ LIGHT = np.array([-0.35, -0.55, 1.0]) / np.linalg.norm([-0.35, -0.55, 1.0])
 _BACKGROUND, _SHADOW = np.array([0.955, 0.955, 0.965]), np.array([0.86, 0.86, 0.885])
 # Triangles longer than this part of the picture are split, so that sorting them by their middles is right.
 _SPLIT = 0.05
+# Of lines between triangles of cloth; of those that close seams, so wide that nothing shines through from behind [pt].
+_EDGE, _SEAM = 0.25, 0.6
 _PAD = 0.06  # around what is drawn, of its longer side
 
 
@@ -118,9 +120,15 @@ def paint(
         lines.append(line)
     triangle, fill, line = (np.concatenate(parts) for parts in (triangles, fills, lines))
     order = np.argsort(triangle[..., 2].mean(axis=1), kind="stable")
+    widths = np.where((line == fill).all(axis=1), _SEAM, _EDGE)[order]
     axes.add_collection(
         collections.PolyCollection(
-            triangle[order][..., :2], facecolors=fill[order], edgecolors=line[order], lw=0.25, zorder=2
+            triangle[order][..., :2],
+            facecolors=fill[order],
+            edgecolors=line[order],
+            lw=widths,
+            joinstyle="round",
+            zorder=2,
         )
     )
 
