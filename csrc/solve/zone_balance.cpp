@@ -16,7 +16,7 @@ constexpr double kRest = 1e-12;     // of the forces: a model that moves nothing
 constexpr int kMaxFactors = 10000;  // of all models of a step
 constexpr int kMaxAtOnce = 2500;    // of them before the balance is searched in rounds
 constexpr int kMaxOfPart = 8;       // models
-constexpr int kMaxRounds = 60;      // of bounds that stand still
+constexpr int kMaxStops = 60;       // of bounds that stand still
 constexpr double kRoundAccuracy = 0.1;  // of what is left of the balance at its begin: to which a round is followed
 constexpr int kMaxDescent = 60;         // models of a round
 constexpr double kNearer = 0.1;         // of what was left before: where the balance is searched at once again
@@ -94,7 +94,7 @@ private:
     StepStatus search_in_rounds(StepStatus status) {
         go_to(m_best);
         double near = kSettled;
-        for (int round = 0; round < kMaxRounds; ++round) {
+        for (int round = 0; round < kMaxStops; ++round) {
             const double left = look().residual;
             if (left < near) {
                 near = kNearer * left;
