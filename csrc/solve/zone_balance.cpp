@@ -17,7 +17,7 @@ constexpr int kMaxFactors = 10000;  // of all models of a step
 constexpr int kMaxAtOnce = 2500;    // of them before the balance is searched in rounds
 constexpr int kMaxStops = 60;       // of bounds that stand still
 constexpr double kRoundAccuracy = 0.1;  // of what is left of the balance at its begin: to which a round is followed
-constexpr int kMaxDescent = 60;         // models of a round
+constexpr int kMaxDescent = 20;         // models of a round
 constexpr double kNearer = 0.1;         // of what was left before: where the balance is searched at once again
 constexpr int kMaxOfRound = 8, kMaxFactorsOfRound = 100;  // models and factorizations of that
 constexpr double kFirstPart = 0.25, kLeastPart = 1e-3;
