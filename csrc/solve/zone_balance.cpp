@@ -89,8 +89,8 @@ private:
     }
 
     /// With bounds of friction that stand still, then follow, and stand still again. In between the balance is where
-    /// an energy is least, which damping finds from anywhere, across contacts that turn and cloth that buckles. Near
-    /// the balance it is searched at once again.
+    /// an energy is least, which models of bounds that do not feed themselves go down on, also across contacts that
+    /// turn. Near the balance it is searched at once again.
     StepStatus search_in_rounds(StepStatus status) {
         go_to(m_best);
         double near = kSettled;
