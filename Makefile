@@ -21,9 +21,9 @@ unexport PYTHONPATH
 
 # Not byte-compiled: Python does that with what is imported, which is a small part of torch, and once.
 INSTALL := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile --constraint constraints.txt
-# ON: a folder of the core is one unit. From nothing that takes less; after a change in one file, longer. A folder of tests
-# always is: they are most of what is compiled, mostly for headers that changed.
-UNITY ?= OFF
+# ON: a folder of the core is one unit, as a folder of tests always is. From nothing that takes much less; after a change
+# in one file, longer: UNITY=OFF for work in one of them.
+UNITY ?= ON
 TREE := DIFFSIM_BUILD_TESTS=ON DIFFSIM_WERROR=ON DIFFSIM_LTO=OFF DIFFSIM_PRECOMPILE=ON DIFFSIM_GROUP_TESTS=ON \
         CMAKE_UNITY_BUILD=$(UNITY) $(if $(shell command -v ccache),CMAKE_CXX_COMPILER_LAUNCHER=ccache)
 export CCACHE_SLOPPINESS := pch_defines,time_macros
