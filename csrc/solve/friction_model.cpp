@@ -10,8 +10,8 @@ namespace diffsim {
 namespace {
 
 constexpr int kCrawlAfter = 10;        // Newton steps before turns are left out, then before all goes in small steps
-constexpr int kMaxBalanceSteps = 300;  // until bounds stop standing still
-constexpr int kMaxConvexSteps = 60;    // where bounds stand still; less than half of them are seen
+constexpr int kMaxBalanceSteps = 300;  // in rounds of bounds that stand still
+constexpr int kMaxConvexSteps = 60;    // where bounds stay from model to model
 constexpr double kBoundChange = 0.1;   // of the largest: bounds that change less may follow again
 constexpr int kMaxFrozenRounds = 10;   // of bounds that stand still
 
@@ -39,7 +39,7 @@ public:
           m_p(p) {}
 
     ModelSolution run() {
-        if (m_goal.stands_still) return minimise();
+        if (m_goal.bounds_stay) return minimise();
         set_reach();
         const Coordinates start = m_p;
         const std::vector<FrictionRow> states = m_friction;
@@ -54,14 +54,19 @@ public:
     }
 
 private:
-    /// Where all bounds stand still.
+    /// With the bounds that rows have.
     ModelSolution minimise() {
         m_frozen = true;
         m_w.bound.resize(m_friction.size());
         for (std::size_t f = 0; f < m_friction.size(); ++f) m_w.bound[f] = m_friction[f].bound;
-        while (find_left() > m_goal.tolerance && m_result.newton_steps < kMaxConvexSteps)
-            if (!newton_step()) return m_result;
-        finish(ModelSolution::Status::solved);
+        ModelSolution::Status status = ModelSolution::Status::solved;
+        while (status == ModelSolution::Status::solved && find_left() > m_goal.tolerance) {
+            if (m_result.newton_steps == kMaxConvexSteps)
+                status = ModelSolution::Status::crawling;
+            else if (!newton_step())
+                return m_result;
+        }
+        finish(status);
         return m_result;
     }
 

@@ -20,10 +20,10 @@ struct BalanceGoal {
     /// Contacts mostly go on as in the last model: those that slip in a direction that is made exact. Compressed ones
     /// have their stiffness, not the secant's.
     bool is_settled = false;
-    bool turns = false;         ///< what rows do not see of contacts is in the model, too; see FrictionTurns
-    bool is_balanced = false;   ///< only slips of sticking contacts are left to end
-    bool may_crawl = true;      ///< a model that is not solved to its end is of use
-    bool stands_still = false;  ///< FrictionRow::bound and ::reach are given, and stay: a convex minimisation
+    bool turns = false;        ///< what rows do not see of contacts is in the model, too; see FrictionTurns
+    bool is_balanced = false;  ///< only slips of sticking contacts are left to end
+    bool may_crawl = true;     ///< a model that is not solved to its end is of use
+    bool bounds_stay = false;  ///< FrictionRow::bound and ::reach are given: a convex minimisation
 };
 
 // How far slips reach, of what a bound presses its contact by: see FrictionRow::reach.

@@ -190,7 +190,7 @@ private:
     }
 
     /// What is left of the balance at the point, and what that asks of the next model.
-    Accuracy look(bool bounds_stand_still = false) {
+    Accuracy look(bool bounds_stay = false) {
         differentiate(zone(), m_work.point, Curvature::none, m_work.derivatives, nullptr);
         add(-1.0, m_held, m_work.derivatives.gradient);
         m_balance = m_work.derivatives.gradient;
@@ -201,8 +201,8 @@ private:
         m_wanted = std::max(m_search.m_options.tolerance, now.floor);
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
         m_model.aim_for(
-            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning && !bounds_stand_still,
-             now.residual < m_wanted, !m_in_parts, bounds_stand_still});
+            {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning && !bounds_stay,
+             now.residual < m_wanted, !m_in_parts, bounds_stay});
         return now;
     }
 

@@ -29,7 +29,7 @@ struct FrictionRow {
     Vec2 slip = Vec2::Zero();           ///< at p = 0 [m]
     Vec2 share = Vec2::Zero(), multiplier = Vec2::Zero();
     bool slips = false, is_known = false;
-    double bound = 0.0;  ///< where bounds stand still, see BalanceGoal: μ force then [kg·m]
+    double bound = 0.0;  ///< of its force, where bounds stay: see BalanceGoal [kg·m]
     double reach = 0.0;  ///< slip against the multiplier at which a sticking contact's force is at its bound [m]
 
     void set_state(const FrictionState& state);
