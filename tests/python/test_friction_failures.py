@@ -84,7 +84,7 @@ def leaning_dominoes() -> ds.Simulator:
 @pytest.mark.parametrize(("name", "make"), [("wall", hit_wall), ("dominoes", leaning_dominoes)])
 def test_hits_of_much_that_lies_flush_converge_in_rounds(name: str, make: Callable[[], ds.Simulator]) -> None:
     """Models of bounds that follow lead to and fro between what sticks and what slips, each through hundreds of
-    factorizations: these steps failed so.
+    factorizations, and a load in parts is no help: without rounds both steps fail.
     """
     fields = json.loads((STATES / "rounds.json").read_text())[name]
     start = ds.State(**{key: torch.tensor(value, dtype=torch.float64) for key, value in fields.items()})
