@@ -209,7 +209,10 @@ def fit(recording: Recording, seen: Tensor) -> Fit:
         jacobian, model = jacrev(look, has_aux=True)(logarithms)
         residual = (model - seen[: len(model)]).detach()
         history.append(float(deviation(residual)))
-        logarithms = logarithms - torch.linalg.lstsq(jacobian, residual[:, None]).solution[:, 0]
+        # Friction has no effect on the first frames: its column is zero, for which torch's default driver reads memory
+        # that nobody wrote, and finds another solution each time (pytorch/pytorch#187411).
+        change = torch.linalg.lstsq(jacobian, residual[:, None], driver="gelsd").solution[:, 0]
+        logarithms = logarithms - change
     with torch.no_grad():
         history.append(float(deviation(recording(logarithms) - seen)))
     return Fit(logarithms, jacobian.detach(), history[-1], history)
