@@ -47,6 +47,9 @@ public:
     void add_friction_forces(Coordinates& gradient);
     /// Of contacts that push at the point, as a motion; see largest_motion().
     double largest_slip() const;
+    /// Where all is nearly at rest: find what friction holds it by, as the next model's start, or change nothing where
+    /// more than the tolerance is left of the balance, in units of |L⁻¹ g|. `gradient`: the energy's.
+    void hold(const Coordinates& gradient, double tolerance);
     /// What friction takes up on this part of the last way, its bounds those of the last model.
     double friction_work(double step) const;
     /// Let the bounds of friction stay what forces make them at the point, from model to model, so that the models are
@@ -103,6 +106,7 @@ private:
     void add_near(int index, const ContactGeometry& geometry);
     void sort_near();
     void make_model();
+    void make_resting_model(const Coordinates& gradient);
     void make_start_row(const NearContact& near);
     void add_friction_row(const NearContact& near, const ContactGeometry& geometry);
     void add_turns();

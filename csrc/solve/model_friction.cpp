@@ -4,9 +4,17 @@
 #include "solve/model_direction.hpp"
 #include "zone/contacts.hpp"
 #include "zone/sides_of.hpp"
+#include "zone/zone_accuracy.hpp"
 
 /// What friction adds to the models of a zone.
 namespace diffsim {
+namespace {
+
+constexpr int kHoldingRounds = 2;
+constexpr double kStill = 1e-10;           // [m]: what slips by less sticks, though its force is at its bound
+constexpr double kHoldingAccuracy = 1e-6;  // of what may be left of the balance: to which each is solved
+
+}  // namespace
 
 /// What sticks is held by the springs of one model, and by the next one's from there on.
 void ModelDirection::advance_multipliers() {
@@ -107,6 +115,53 @@ double ModelDirection::largest_slip() const {
         largest = std::max(largest, std::sqrt(mass) * slip.slip.norm());
     }
     return largest;
+}
+
+/// At rest the contacts' own forces are known from where all is, and what friction has to add is a convex problem: of
+/// friction with bounds that stay against inertia alone, which is so soft beside the springs of what sticks that a
+/// round of multipliers leaves next to nothing. In a model the springs of the contacts work against it.
+void ModelDirection::hold(const Coordinates& gradient, double tolerance) {
+    make_resting_model(gradient);
+    std::vector<double> forces;
+    for (const ContactRow& row : m_model.rows) forces.push_back(row.force);
+    BalanceGoal goal;
+    goal.tolerance = kHoldingAccuracy * tolerance;
+    goal.bounds_stay = true;
+    Coordinates p;
+    for (int round = 0; round < kHoldingRounds; ++round) {
+        p.assign_zero(static_cast<std::size_t>(m_zone.dynamic_count), m_zone.nodes.size());
+        if (balance(m_model, m_zone, goal, m_system, m_balance, p).status != ModelSolution::Status::solved) return;
+        for (FrictionRow& slip : m_model.friction) slip.multiplier = slip.share;
+    }
+    Coordinates left = gradient;
+    for (FrictionRow& slip : m_model.friction) {
+        add_friction(slip, m_model.rows[slip.normal], slip.bound * slip.share, left);
+        slip.slips = slip.slips && slip.slip.norm() > kStill;
+    }
+    if (largest_scaled(m_zone, left) > tolerance) return;
+    for (std::size_t r = 0; r < forces.size(); ++r) m_model.rows[r].force = forces[r];
+    keep_forces();
+}
+
+/// Its rows have the contacts' forces, and no stiffness.
+void ModelDirection::make_resting_model(const Coordinates& gradient) {
+    m_weight.resize(static_cast<std::size_t>(m_zone.dynamic_count) + m_zone.nodes.size(), 0.0);
+    m_gradient = &gradient;
+    m_with_curvature = false;
+    recall_forces();
+    m_near.clear();
+    for (const ActiveContact& active : m_point.active) add_near(active.index, active.geometry);
+    make_model();
+    m_model.gradient = gradient;  // with the contacts' forces in it
+    for (ContactRow& row : m_model.rows) {
+        row.force = row.stiffness * row.missing;
+        row.stiffness = 0.0;
+    }
+    for (FrictionRow& slip : m_model.friction) {
+        const ContactRow& row = m_model.rows[slip.normal];
+        slip.bound = slip.coefficient * row.force;
+        slip.reach = kHoldingShare * slip.coefficient * row.missing;
+    }
 }
 
 double ModelDirection::friction_work(double step) const {

@@ -11,11 +11,12 @@ constexpr double kSettled = 1e-2;        // residual below which contacts mostly
 constexpr double kTurning = 0.1;         // the same below which models see how contacts turn
 constexpr double kModelAccuracy = 1e-2;  // of the residual: to which models are solved
 constexpr double kModelTolerance = 0.7;  // of the tolerance, at most
-constexpr int kMaxDamped = 4;       // models in a row: what friction takes up is known of the last model's bounds alone
-constexpr double kRest = 1e-12;     // of the forces: a model that moves nothing further has found the balance
-constexpr int kMaxFactors = 10000;  // of all models of a step
-constexpr int kMaxAtOnce = 2500;    // of them before the balance is searched in rounds
-constexpr int kMaxStops = 60;       // of bounds that stand still
+constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is known of the last model's bounds alone
+constexpr double kRest = 1e-12;  // of the forces: a model that moves nothing further has found the balance
+constexpr double kNearlyRests = 1e-6;   // of the forces: slips up to which it may be held by forces found beforehand
+constexpr int kMaxFactors = 10000;      // of all models of a step
+constexpr int kMaxAtOnce = 2500;        // of them before the balance is searched in rounds
+constexpr int kMaxStops = 60;           // of bounds that stand still
 constexpr double kRoundAccuracy = 0.1;  // of what is left of the balance at its begin: to which a round is followed
 constexpr int kMaxDescent = 20;         // models of a round
 constexpr double kNearer = 0.1;         // of what was left before: where the balance is searched at once again
@@ -32,6 +33,7 @@ public:
 
     void run() {
         m_search.m_result.iterations = 0;
+        if (m_search.drives_done() && rests()) return;
         StepStatus status = search(m_search.m_options.max_iterations, kMaxAtOnce);
         if (status == StepStatus::blocked) return m_search.fail(status);
         if (status != StepStatus::converged && m_least < kInfinity) status = search_in_rounds(status);
@@ -62,7 +64,6 @@ private:
             if (driven && !is_held()) keep_best(now);
             if (m_is_rough && now.residual < kEnough) return StepStatus::converged;
             if (iterations >= max_iterations) return StepStatus::too_many_iterations;
-            if (iterations == 0 && driven && !m_in_parts && rests(now)) return StepStatus::converged;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
             m_factors += way.newton_steps;
             if (m_factors > (driven ? std::min(max_factors, kMaxFactors) : kMaxFactors)) return StepStatus::crawls;
@@ -76,7 +77,7 @@ private:
             m_search.m_path.set_trial(m_work.y_end, step);
             if (step == 1.0) m_work.trial.y = m_work.y_end;
             evaluate(zone(), m_work.trial, &m_work.point);
-            if (iterations > 0 && step == 1.0 && now.residual < kGoodEnough * m_wanted &&
+            if (step == 1.0 && now.residual < kGoodEnough * m_wanted &&
                 (motion <= kRest * now.reference || stands_still(motion))) {
                 m_search.accept_trial();
                 return StepStatus::converged;
@@ -224,9 +225,16 @@ private:
         go_to(m_best);
     }
 
-    /// Whether the point is the solution, with contacts that do not slip and that nothing pulls at.
-    bool rests(const Accuracy& now) const {
-        return now.residual < m_wanted && m_model.largest_slip() <= kRest * now.reference;
+    /// Whether the point is the solution, with contacts that do not slip.
+    bool rests() {
+        Accuracy now = look();
+        const double slip = m_model.largest_slip();
+        if (slip > kNearlyRests * now.reference) return false;
+        if (now.residual > m_wanted) {
+            m_model.hold(m_work.derivatives.gradient, kGoodEnough * m_wanted * now.reference);
+            now = look();
+        }
+        return now.residual < m_wanted && slip <= kRest * now.reference;
     }
 
     /// Of the way to y_end.

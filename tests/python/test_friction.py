@@ -107,8 +107,9 @@ def test_contacts_tell_what_holds_a_box() -> None:
     weight = sim.mass.item() * G
     slope = math.radians(20.0)
     assert contacts.sticking.all() and sim.info.sticking == len(contacts) and sim.info.slipping == 0
-    assert contacts.friction[:, 0].sum().item() == pytest.approx(-weight * math.sin(slope), rel=1e-9)
-    assert contacts.normal_force[:, 2].sum().item() == pytest.approx(weight * math.cos(slope), rel=1e-9)
+    # Contacts know their compression of 1e-7 m, and so their forces, up to the rounding of where the box is.
+    assert contacts.friction[:, 0].sum().item() == pytest.approx(-weight * math.sin(slope), rel=5e-9)
+    assert contacts.normal_force[:, 2].sum().item() == pytest.approx(weight * math.cos(slope), rel=5e-9)
     torch.testing.assert_close(contacts.force, contacts.normal_force + contacts.friction)
     sliding = on_ground(0.2, degrees=20.0)
     contacts = sliding.contacts(end_of(sliding, 10))

@@ -165,6 +165,28 @@ def test_what_rests_takes_no_iteration() -> None:
     assert after.velocity.abs().max() == 0.0
 
 
+@pytest.mark.parametrize("scene", [scenes.boxes_in_bin(20), scenes.two_layer_stack(6)], ids=["bin", "layers"])
+def test_what_leans_on_each_other_rests_without_an_iteration(scene: ds.Scene) -> None:
+    """What friction holds them by no state tells: it is found for all of them together, where they are."""
+    sim = ds.Simulator(scene, DT, on_failure="raise")
+    with torch.no_grad():
+        sim.friction.fill_(0.5)
+    state = sim.rollout(sim.initial_state(), steps=400)[-1]
+    contacts = sim.contacts(state)
+    across = contacts.friction.norm(dim=1)
+    assert across.max() > 1e-2 * contacts.normal_force.norm(dim=1).max()
+    assert (across <= 0.5 * contacts.normal_force.norm(dim=1) * (1.0 + 1e-9)).all()
+    assert contacts.sticking.all()
+    weight = -sim.mass.detach()[:, None] * sim.gravity.detach()
+    free = sim.mass.detach() > 0.0
+    torch.testing.assert_close(contacts.net_force()[free], weight[free], rtol=0.0, atol=1e-7 * float(weight.max()))
+    after = sim.rollout(state, steps=50)
+    assert sim.info.iterations == 0
+    for name in ("position", "orientation"):
+        assert torch.equal(getattr(after[-1], name), getattr(state, name)), name
+    assert after[-1].velocity.abs().max() < 1e-16
+
+
 @pytest.mark.parametrize("friction", [0.5, 1.0])
 def test_bricks_that_land_flush_on_each_other_converge(friction: float) -> None:
     """Many contacts come to push in one step: with springs as stiff at first as near the balance models crawl, and take
