@@ -12,6 +12,8 @@ struct ContactFriction {
     bool slips = false;         ///< |u| = 1, along the slip
 };
 
+inline constexpr double kRestingSlip = 1e-11;  ///< [m]: what slips by less has no direction, and counts as sticking
+
 struct FrictionFrame {
     Vec3 point;                    ///< where the two surfaces meet, margins included: both objects are pushed here
     std::array<Vec3, 2> tangents;  ///< orthonormal, and to the normal

@@ -21,7 +21,7 @@ constexpr double kNegligible = 1e-6;  // of the forces: what bounds that follow 
 constexpr double kLinearTolerance = 1e-8;
 constexpr int kMaxLinear = 30;          // iterations of GMRES
 constexpr double kSettledReach = 0.01;  // of its slip
-constexpr double kRestingSlip = 1e-10;  // [m]: less has no direction
+constexpr double kDirected = 1e-10;     // [m]: slips of less may turn
 
 /// One model; the steps of balance() as members.
 class Balance {
@@ -155,7 +155,7 @@ private:
                 const double pressed = count > 0 ? sum / count / row.stiffness : row.range;
                 slip.reach = share * slip.coefficient * pressed;
                 const double size = slip.slip.norm();
-                if (m_goal.is_settled && slip.slips && size > kRestingSlip)
+                if (m_goal.is_settled && slip.slips && size > kDirected)
                     slip.reach = std::min(slip.reach, kSettledReach * size);
                 if (slip.is_known) continue;
                 slip.slips = size > slip.reach;

@@ -56,11 +56,8 @@ public:
     /// those of an energy. What sticks is held from where it is on. `share`: see FrictionRow::reach.
     void stop_bounds(double share);
     void let_bounds_follow() { m_stopped.clear(); }
-    /// The states of the last model, one per contact of the zone.
-    const std::vector<FrictionState>& friction() {
-        recall_forces();
-        return m_friction;
-    }
+    /// What a contact of the point does by the last model.
+    ContactFriction friction_of(const ActiveContact& active);
 
     /// Find where the model leads from the current point: y_end. `gradient`: the energy's there. The list of contacts
     /// is made complete for the way. `driven`: all that is driven has reached its target. Where nothing is near then,

@@ -11,7 +11,6 @@ namespace diffsim {
 namespace {
 
 constexpr int kHoldingRounds = 2;
-constexpr double kStill = 1e-10;           // [m]: what slips by less sticks, though its force is at its bound
 constexpr double kHoldingAccuracy = 1e-6;  // of what may be left of the balance: to which each is solved
 
 }  // namespace
@@ -35,19 +34,11 @@ Vec2 ModelDirection::Stopped::pull(const FrictionRow& slip) const {
 void ModelDirection::stop_bounds(double share) {
     recall_forces();
     std::vector<Stopped> stopped;
-    const Placement at{m_point.y, m_point.poses, m_point.nodes};
     for (const ActiveContact& active : m_point.active) {
         const ZoneContact& contact = m_zone.contacts[active.index];
         const double bound = contact.law.friction * contact_force(active.geometry, contact.law);
         if (!(bound > 0.0)) continue;
-        FrictionState& state = m_friction[static_cast<std::size_t>(active.index)];
-        if (const Stopped* before = find_stopped(contact.contact)) {
-            const FrictionRow slip = make_friction_row(m_zone, contact, active.geometry, at, at.y);
-            const Vec2 pulled = before->pull(slip) / before->bound;
-            state.slips = before->stretch(slip).norm() > before->reach;
-            state.share = pulled[0] * slip.tangents[0] + pulled[1] * slip.tangents[1];
-            state.is_known = true;
-        }
+        const FrictionState& state = m_friction[static_cast<std::size_t>(active.index)];
         const double compression = contact.law.range.rest - active.geometry.distance;
         stopped.push_back({contact.contact, bound, share * contact.law.friction * compression, state.share});
     }
@@ -96,6 +87,16 @@ void ModelDirection::add_friction_forces(Coordinates& gradient) {
     }
 }
 
+ContactFriction ModelDirection::friction_of(const ActiveContact& active) {
+    recall_forces();
+    const ZoneContact& contact = m_zone.contacts[active.index];
+    ContactFriction found = m_friction[static_cast<std::size_t>(active.index)];
+    if (!found.slips || active.geometry.sine_sq == 0.0) return found;
+    const Placement at{m_point.y, m_point.poses, m_point.nodes};
+    found.slips = make_friction_row(m_zone, contact, active.geometry, at, at.y).slip.norm() > kRestingSlip;
+    return found;
+}
+
 double ModelDirection::largest_slip() const {
     const Placement at{m_point.y, m_point.poses, m_point.nodes};
     double largest = 0.0;
@@ -136,7 +137,7 @@ void ModelDirection::hold(const Coordinates& gradient, double tolerance) {
     Coordinates left = gradient;
     for (FrictionRow& slip : m_model.friction) {
         add_friction(slip, m_model.rows[slip.normal], slip.bound * slip.share, left);
-        slip.slips = slip.slips && slip.slip.norm() > kStill;
+        slip.slips = slip.slips && slip.slip.norm() > kRestingSlip;
     }
     if (largest_scaled(m_zone, left) > tolerance) return;
     for (std::size_t r = 0; r < forces.size(); ++r) m_model.rows[r].force = forces[r];

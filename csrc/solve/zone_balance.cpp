@@ -15,7 +15,8 @@ constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is k
 constexpr double kRest = 1e-12;  // of the forces: a model that moves nothing further has found the balance
 constexpr double kNearlyRests = 1e-6;   // of the forces: slips up to which it may be held by forces found beforehand
 constexpr int kMaxFactors = 10000;      // of all models of a step
-constexpr int kMaxAtOnce = 2500;        // of them before the balance is searched in rounds
+constexpr int kMaxAtFirst = 300;        // of them before the balance is searched in rounds
+constexpr int kMaxAtOnce = 2500;        // and where that does not find it either
 constexpr int kMaxStops = 60;           // of bounds that stand still
 constexpr double kRoundAccuracy = 0.1;  // of what is left of the balance at its begin: to which a round is followed
 constexpr int kMaxDescent = 20;         // models of a round
@@ -34,9 +35,16 @@ public:
     void run() {
         m_search.m_result.iterations = 0;
         if (m_search.drives_done() && rests()) return;
-        StepStatus status = search(m_search.m_options.max_iterations, kMaxAtOnce);
+        const int most = m_search.m_options.max_iterations;
+        StepStatus status = search(most, kMaxAtFirst);
         if (status == StepStatus::blocked) return m_search.fail(status);
+        const Start there = {m_work.point.y, {}, m_model.memory()};
         if (status != StepStatus::converged && m_least < kInfinity) status = search_in_rounds(status);
+        if (status != StepStatus::converged && m_least < kInfinity) {
+            go_to(there.y);
+            m_model.recall(there.contacts);
+            status = search(most, kMaxAtOnce);
+        }
         if (status != StepStatus::converged && m_least < kInfinity && !is_driven()) status = search_in_parts(status);
         if (status != StepStatus::converged) fail(status);
     }
@@ -63,7 +71,9 @@ private:
             const Accuracy now = look();
             if (driven && !is_held()) keep_best(now);
             if (m_is_rough && now.residual < kEnough) return StepStatus::converged;
-            if (iterations >= max_iterations) return StepStatus::too_many_iterations;
+            const bool ends = now.residual < kGoodEnough * m_wanted;  // only what sticks still slips
+            if (iterations >= (ends ? m_search.m_options.max_iterations : max_iterations))
+                return StepStatus::too_many_iterations;
             const ModelDirection::Way way = m_model.find(m_work.derivatives.gradient, driven, m_work.y_end);
             m_factors += way.newton_steps;
             if (m_factors > (driven ? std::min(max_factors, kMaxFactors) : kMaxFactors)) return StepStatus::crawls;
@@ -203,7 +213,7 @@ private:
         const double tolerance = std::max(kModelTolerance * m_wanted, kModelAccuracy * std::min(1.0, now.residual));
         m_model.aim_for(
             {tolerance * now.reference, now.residual < kSettled, now.residual < kTurning && !bounds_stay,
-             now.residual < m_wanted, !m_in_parts, bounds_stay});
+             now.residual < kGoodEnough * m_wanted, !m_in_parts, bounds_stay});
         return now;
     }
 
@@ -292,10 +302,9 @@ private:
 
 void find_balance(ZoneSearch& search, ModelDirection& model) {
     BalanceSearch(search, model).run();
-    search.m_work.friction.resize(search.m_work.point.active.size());
-    const std::vector<FrictionState>& states = model.friction();
-    for (std::size_t k = 0; k < search.m_work.friction.size(); ++k)
-        search.m_work.friction[k] = states[static_cast<std::size_t>(search.m_work.point.active[k].index)];
+    search.m_work.friction.clear();
+    for (const ActiveContact& active : search.m_work.point.active)
+        search.m_work.friction.push_back(model.friction_of(active));
 }
 
 }  // namespace diffsim

@@ -10,8 +10,6 @@
 namespace diffsim {
 namespace {
 
-constexpr double kRestingSlip = 1e-11;  // [m]: what slips by less has no direction, and counts as sticking
-
 /// How a contact changes, to first order, when its sides are elsewhere.
 template <int kSize>
 struct Changes {

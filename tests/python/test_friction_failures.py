@@ -32,17 +32,19 @@ def walled_in(index: int, state: dict[str, list[float]]) -> tuple[ds.Simulator, 
 
 
 def test_a_step_that_fails_leaves_a_state_from_which_the_next_recover(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is that of its models in which least was left of the balance. The last one's may be squeezed to the floor. A
-    body moves here as it is told, and jams others.
+    """A body moves here as it is told, and jams others: not every step has a balance. But what one leaves unsolved, the
+    next does not inherit for long.
     """
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent))
     sim, state, control = walled_in(99, json.loads((STATES / "jam.json").read_text()))
-    failed = 0
+    in_a_row, failed = 0, []
     with torch.no_grad():
         for _ in range(20):
             state = sim(state, control)
-            failed += not sim.info.converged
-    assert failed <= 4  # from the last model's state ten or more
+            in_a_row = 0 if sim.info.converged else in_a_row + 1
+            failed.append(in_a_row)
+    assert 0 < max(failed) <= 2
+    assert sum(f > 0 for f in failed) < 10
 
 
 @pytest.mark.parametrize("index", [47, 68, 75])
