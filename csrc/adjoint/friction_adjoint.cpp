@@ -1,5 +1,6 @@
 #include "adjoint/friction_adjoint.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 #include "zone/gmres.hpp"
@@ -12,6 +13,18 @@ constexpr double kGive = 0.01;             // of the springs' inverse: what slip
 constexpr int kRounds = 3;                 // each leaves about kGive / kSpring of what slips give
 constexpr double kLinearTolerance = 1e-9;  // of a round
 constexpr int kMaxLinear = 60;
+constexpr double kSame = 1e-9;  // of slips: what differs by less is the same
+
+/// Of the same bodies or nodes.
+bool of_the_same(const FrictionTerm& a, const FrictionTerm& b) {
+    const auto same = [](const auto& x, const auto& y) { return x.body == y.body && x.nodes == y.nodes; };
+    return a.side_count == b.side_count && std::equal(a.sides.begin(), a.sides.end(), b.sides.begin(), same);
+}
+
+template <class Matrix>
+bool is_near(const Matrix& a, const Matrix& b) {
+    return a.rows() == b.rows() && a.cols() == b.cols() && (a - b).norm() <= kSame * b.norm();
+}
 
 }  // namespace
 
@@ -27,6 +40,22 @@ FrictionAdjoint::FrictionAdjoint(const Zone& zone, const ZonePoint& point, const
         const double force = contact_force(active.geometry, law);
         make_friction_term(zone, point, active.index, active.geometry, force, friction[k], term);
         term.contact = active.index;
+    }
+    find_held();
+}
+
+/// A corner on an edge touches it with each feature that ends there.
+void FrictionAdjoint::find_held() {
+    for (std::size_t k = 0; k < m_terms.size(); ++k) {
+        Term& term = m_terms[k];
+        if (!term.sticks) continue;
+        Term* same = nullptr;
+        for (std::size_t l = k; l-- > 0 && same == nullptr && of_the_same(m_terms[l], term);)
+            if (m_terms[l].holds && is_near(m_terms[l].slip, term.slip) && is_near(m_terms[l].rows, term.rows))
+                same = &m_terms[l];
+        term.holds = same == nullptr;
+        if (term.holds) m_held.push_back(k);
+        (term.holds ? term : *same).stiffness_held += term.stiffness;
     }
 }
 
@@ -57,20 +86,20 @@ void FrictionAdjoint::add_symmetric(const Term& term, const SmallMatrix& matrix,
 
 double FrictionAdjoint::dot(const Unknowns& x, const Unknowns& y) const {
     double sum = mass_dot(m_zone, x.z, y.z);
-    for (std::size_t k = 0; k < m_terms.size(); ++k)
-        if (m_terms[k].sticks) sum += x.multipliers[k].dot(y.multipliers[k]) / m_terms[k].stiffness;
+    for (std::size_t k = 0; k < m_held.size(); ++k)
+        sum += x.multipliers[k].dot(y.multipliers[k]) / m_terms[m_held[k]].stiffness_held;
     return sum;
 }
 
 bool FrictionAdjoint::factorize(BlockSystem& system) {
     m_matrices.clear();
     for (Term& term : m_terms) {
-        term.spring = term.sticks ? kSpring * term.stiffness : 0.0;
+        term.spring = term.holds ? kSpring * term.stiffness_held : 0.0;
         const Mat2 along = term.sticks ? Mat2(term.spring * Mat2::Identity()) : term.symmetric;
         const SmallMatrix symmetric = term.rows * along * term.rows.transpose();
         add_symmetric(term, symmetric, system);
         SmallMatrix beyond = term.changes - symmetric;
-        if (term.sticks) beyond += term.spring * term.rows * term.slip;
+        if (term.holds) beyond += term.spring * term.rows * term.slip;
         m_matrices.add(term, beyond);
     }
     return system.factorize();
@@ -81,11 +110,10 @@ FrictionAdjoint::Unknowns FrictionAdjoint::preconditioned(
     const BlockSystem& system, const Unknowns& x, double give) const {
     Unknowns result;
     result.z.assign_zero(x.z.bodies.size(), x.z.nodes.size());
-    result.multipliers.assign(m_terms.size(), Vec2::Zero());
+    result.multipliers.resize(m_held.size());
     m_matrices.add_transposed_product(m_zone, 1.0, x.z, result.z);
-    for (std::size_t k = 0; k < m_terms.size(); ++k) {
-        const Term& term = m_terms[k];
-        if (!term.sticks) continue;
+    for (std::size_t k = 0; k < m_held.size(); ++k) {
+        const Term& term = m_terms[m_held[k]];
         result.multipliers[k] =
             -term.spring * slips_along(term.rows, gather(m_zone, term, x.z)) - (1.0 - give) * x.multipliers[k];
         scatter(m_zone, term, -1.0, forces_of(term.slip, result.multipliers[k]), result.z);
@@ -99,7 +127,7 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
     if (!factorize(system)) return false;
     const auto apply = [&](const Unknowns& x) { return preconditioned(system, x, kGive); };
     const auto product = [&](const Unknowns& x, const Unknowns& y) { return dot(x, y); };
-    Unknowns left{z, std::vector<Vec2>(m_terms.size(), Vec2::Zero())};
+    Unknowns left{z, std::vector<Vec2>(m_held.size(), Vec2::Zero())};
     system.solve_in_place(left.z);
     const Unknowns begin = left;
     Unknowns x = left;
@@ -112,10 +140,9 @@ bool FrictionAdjoint::solve(BlockSystem& system, Coordinates& z) {
         add(-1.0, preconditioned(system, x, 0.0), left);
     }
     z = x.z;
-    for (std::size_t k = 0; k < m_terms.size(); ++k) {
-        Term& term = m_terms[k];
-        if (term.sticks)
-            term.multiplier = x.multipliers[k] + term.spring * slips_along(term.rows, gather(m_zone, term, z));
+    for (std::size_t k = 0; k < m_held.size(); ++k) {
+        Term& term = m_terms[m_held[k]];
+        term.multiplier = x.multipliers[k] + term.spring * slips_along(term.rows, gather(m_zone, term, z));
     }
     return true;
 }

@@ -13,7 +13,8 @@
 ///     Kᵀ z + Cᵀ ζ = v,  Bᵀ z = 0,
 /// is solved by GMRES for z and ζ together, with the factor of a symmetric matrix: H, what of friction is symmetric,
 /// and springs along the slips of sticking contacts. Rows that depend on each other leave ζ open: each round gives the
-/// second equation a little of ζ, and the next one takes the error that this makes.
+/// second equation a little of ζ, and the next one takes the error that this makes. Features that meet in one point
+/// slip alike, and have one ζ.
 namespace diffsim {
 
 class FrictionAdjoint {
@@ -36,12 +37,14 @@ public:
 private:
     struct Term : FrictionTerm {
         int contact = 0;                 ///< index into Zone::contacts
-        double spring = 0.0;             ///< sticking: of the system along its slip
+        bool holds = false;              ///< sticks, as the first of those that meet in one point
+        double stiffness_held = 0.0;     ///< of all of these [kg]
+        double spring = 0.0;             ///< where it holds: of the system along its slip
         Vec2 multiplier = Vec2::Zero();  ///< ζ
     };
     struct Unknowns {
         Coordinates z;
-        std::vector<Vec2> multipliers;  ///< of terms that stick; zero elsewhere
+        std::vector<Vec2> multipliers;  ///< of terms that hold
 
         friend void add(double factor, const Unknowns& x, Unknowns& sum) {
             add(factor, x.z, sum.z);
@@ -54,6 +57,7 @@ private:
         friend int count(const Unknowns& x) { return count(x.z) + 2 * static_cast<int>(x.multipliers.size()); }
     };
 
+    void find_held();
     bool factorize(BlockSystem& system);
     Unknowns preconditioned(const BlockSystem& system, const Unknowns& x, double give) const;
     double dot(const Unknowns& x, const Unknowns& y) const;
@@ -61,6 +65,7 @@ private:
 
     const Zone& m_zone;
     std::vector<Term> m_terms;
+    std::vector<std::size_t> m_held;  // those that hold
     SideMatrices m_matrices;  // Kᵀ's part of friction with that of the springs, less what the system has of them
 };
 
