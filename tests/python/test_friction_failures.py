@@ -32,19 +32,21 @@ def walled_in(index: int, state: dict[str, list[float]]) -> tuple[ds.Simulator, 
 
 
 def test_a_step_that_fails_leaves_a_state_from_which_the_next_recover(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A body moves here as it is told, and jams others: not every step has a balance. But what one leaves unsolved, the
-    next does not inherit for long.
+    """It is that of its models in which least was left of the balance; the last one's is squeezed by half the thickness.
+    A body moves here as it is told, and jams others: not every step has a balance.
     """
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent))
     sim, state, control = walled_in(99, json.loads((STATES / "jam.json").read_text()))
-    in_a_row, failed = 0, []
+    in_a_row, longest, squeezed = 0, 0, []
     with torch.no_grad():
         for _ in range(20):
             state = sim(state, control)
             in_a_row = 0 if sim.info.converged else in_a_row + 1
-            failed.append(in_a_row)
-    assert 0 < max(failed) <= 2
-    assert sum(f > 0 for f in failed) < 10
+            longest = max(longest, in_a_row)
+            if any(failure.status == "crawls" for failure in sim.info.failures):
+                squeezed.append(sim.info.max_compression / sim.thickness)
+    assert squeezed and max(squeezed) < 0.1
+    assert longest <= 2
 
 
 @pytest.mark.parametrize("index", [47, 68, 75])
