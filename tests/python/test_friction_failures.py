@@ -32,8 +32,8 @@ def walled_in(index: int, state: dict[str, list[float]]) -> tuple[ds.Simulator, 
 
 
 def test_a_step_that_fails_leaves_a_state_from_which_the_next_recover(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is that of its models in which least was left of the balance; the last one's is squeezed by half the thickness.
-    A body moves here as it is told, and jams others: not every step has a balance.
+    """It is that of its models in which least was left of the balance; the last one's is squeezed by half the
+    thickness. A body moves here as it is told, and jams others: not every step has a balance.
     """
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent))
     sim, state, control = walled_in(99, json.loads((STATES / "jam.json").read_text()))
