@@ -37,16 +37,16 @@ def test_a_step_that_fails_leaves_a_state_from_which_the_next_recover(monkeypatc
     """
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent))
     sim, state, control = walled_in(99, json.loads((STATES / "jam.json").read_text()))
-    in_a_row, longest, squeezed = 0, 0, []
     with torch.no_grad():
-        for _ in range(20):
+        for _ in range(8):
             state = sim(state, control)
-            in_a_row = 0 if sim.info.converged else in_a_row + 1
-            longest = max(longest, in_a_row)
             if any(failure.status == "crawls" for failure in sim.info.failures):
-                squeezed.append(sim.info.max_compression / sim.thickness)
-    assert squeezed and max(squeezed) < 0.1
-    assert longest <= 2
+                break
+        else:
+            pytest.fail("every step has a balance")
+        assert sim.info.max_compression < 0.1 * sim.thickness
+        sim(state, control)
+    assert sim.info.converged
 
 
 @pytest.mark.parametrize("index", [47, 68, 75])
