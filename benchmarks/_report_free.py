@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from _report_motion import MUJOCO_SMOOTH, TENTHS, TRAPEZOIDAL, G, Motion, ValueScene, diffsim, rms
+from _report_motion import MUJOCO_SMOOTH, SECOND_ORDER, TENTHS, G, Motion, ValueScene, diffsim, rms
 
 import diffsim as ds
 
@@ -133,7 +133,7 @@ FREE = (
         1.0,
         TENTHS,
         {"path (rms) [m]": _projectile_error},
-        (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
+        (diffsim(), SECOND_ORDER, *MUJOCO_SMOOTH),
         note=_CALL,
     ),
     ValueScene(
@@ -144,7 +144,7 @@ FREE = (
         4.0,
         TENTHS,
         {"attitude after 4 s [rad]": _brick_angle, "relative error of the energy": _energy},
-        (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
+        (diffsim(), SECOND_ORDER, *MUJOCO_SMOOTH),
         note=_ORDER,
     ),
     ValueScene(
@@ -155,7 +155,7 @@ FREE = (
         2.0,
         TENTHS,
         {"attitude after 2 s [rad]": _coin_angle, "relative error of the energy": _energy},
-        (diffsim(), TRAPEZOIDAL, *MUJOCO_SMOOTH),
+        (diffsim(), SECOND_ORDER, *MUJOCO_SMOOTH),
         note=_ORDER,
     ),
 )

@@ -49,7 +49,7 @@ def _bowled_to(values: Tensor, inputs: Inputs) -> Tensor:
 _BOTH = ("friction", ([0, 1],))  # the coefficients of body and ground, as one number
 _STEPS = (0.02, 0.01, 0.005, 0.0025, 0.00125)
 _PEERS = (Settings("Euler"), ELLIPTIC, CREEPS_LEAST)
-_MODES = (("exact", {}), ("trapezoidal", {"integrator": "trapezoidal"}))
+_MODES = (("exact", {}), ("second_order", {"integrator": "second_order"}))
 
 FRICTION_GRADIENTS = (
     GradientScene(

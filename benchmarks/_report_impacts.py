@@ -10,8 +10,8 @@ from _report_motion import (
     HARD,
     LOOSE,
     MUJOCO,
+    SECOND_ORDER,
     TENTHS,
-    TRAPEZOIDAL,
     G,
     Motion,
     ValueScene,
@@ -133,7 +133,7 @@ IMPACTS = (
         0.8,
         TENTHS,
         {"height (rms over time) [m]": _landing_height, "deepest penetration [m]": _landing_depth},
-        (diffsim(), TRAPEZOIDAL, HARD, *MUJOCO),
+        (diffsim(), SECOND_ORDER, HARD, *MUJOCO),
     ),
     ValueScene(
         "push",
@@ -143,7 +143,7 @@ IMPACTS = (
         0.8,
         TENTHS,
         {"centres at the end (rms) [m]": _balls_error},
-        (diffsim(), TRAPEZOIDAL, HARD, *MUJOCO),
+        (diffsim(), SECOND_ORDER, HARD, *MUJOCO),
     ),
     ValueScene(
         "oblique",
@@ -153,7 +153,7 @@ IMPACTS = (
         0.8,
         TENTHS,
         {"centres at the end (rms) [m]": _balls_error},
-        (diffsim(), TRAPEZOIDAL, HARD, *MUJOCO),
+        (diffsim(), SECOND_ORDER, HARD, *MUJOCO),
     ),
     ValueScene(
         "stack",
@@ -163,7 +163,7 @@ IMPACTS = (
         60.0,
         (0.02, 0.01, 0.005),
         {"creep sideways [m]": creep, "deepest penetration [m]": _stack_depth},
-        (diffsim(), TRAPEZOIDAL, HARD, LOOSE, *MUJOCO),
+        (diffsim(), SECOND_ORDER, HARD, LOOSE, *MUJOCO),
         note="Without friction nothing holds a stack sideways: boxes that stand off their middles tilt by what contacts"
         " give way, and slide. Hard contacts (`compliance=0`) give nothing.",
     ),
@@ -175,7 +175,7 @@ IMPACTS = (
         1.5,
         (0.02, 0.01, 0.005, 0.0025),
         {"deepest penetration [m]": _bin_depth, "energy made / energy lost": energy_made},
-        (diffsim(), TRAPEZOIDAL, LOOSE, *MUJOCO),
+        (diffsim(), SECOND_ORDER, LOOSE, *MUJOCO),
         note=_HEAPS,
     ),
     ValueScene(
@@ -186,7 +186,7 @@ IMPACTS = (
         1.0,
         (0.02, 0.01, 0.005, 0.0025),
         {"deepest penetration [m]": _pile_depth, "energy made / energy lost": energy_made},
-        (diffsim(), TRAPEZOIDAL, LOOSE, *MUJOCO),
+        (diffsim(), SECOND_ORDER, LOOSE, *MUJOCO),
         note=_HEAPS,
     ),
 )

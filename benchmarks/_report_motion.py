@@ -71,6 +71,7 @@ class ValueScene:
     errors: Mapping[str, Error]  # by the label of their axis
     methods: Sequence[Method]
     limit_dt: float | None = None  # of the run errors are from, without closed form [s]
+    limit: Method | None = None  # of the same, for methods that have no limit of their own; the first if none
     quick: bool = False  # part of quick runs
     note: str = ""  # why a peer is better here, or seems to be
 
@@ -162,7 +163,7 @@ MUJOCO = (*MUJOCO_SMOOTH, mujoco_bodies(Settings("implicitfast", stiff=True)))
 
 HARD = diffsim("diffsim compliance=0", compliance=0.0)
 LOOSE = diffsim("diffsim tolerance=1e-4", tolerance=1e-4)
-TRAPEZOIDAL = diffsim("diffsim trapezoidal", integrator="trapezoidal")
+SECOND_ORDER = diffsim("diffsim second_order", integrator="second_order")
 SPLIT = diffsim("diffsim split", coupling="split")
 SPLIT_ONCE = diffsim("diffsim split 1 Newton", coupling="split", newton_iterations=1)
 TENTHS = (0.04, 0.02, 0.01, 0.005, 0.0025, 0.00125)

@@ -111,7 +111,7 @@ def measure_values(case: ValueScene, report: Report, steps: tuple[float, ...], d
             motion = run.motion()
             limit = None
             if limit_dt is not None:
-                which = method if method.own_limit else case.methods[0]
+                which = method if method.own_limit else case.limit or case.methods[0]
                 if which.name not in limits:
                     limits[which.name] = which.prepare(case.build(), limit_dt, duration).motion()
                 limit = limits[which.name]
@@ -194,19 +194,20 @@ INTRODUCTION = (
     " steps. MuJoCo runs with the scene's friction, without where there is none, and with its default contacts and"
     " pyramidal cones, unless a name says otherwise. Ours keeps surfaces apart by the scene's thickness, which closed"
     " forms take into account; errors of exactly 0 are drawn at the bottom.",
-    "*Smooth motion*: our default steps are implicit Euler, of first order; `trapezoidal` is of second order there,"
-    " keeps what free motion keeps, and pays for contact with a second solve. MuJoCo's RK4 is of fourth order.",
-    "*Why implicit Euler is the default*: where things meet, the errors of `trapezoidal` are the same (push, oblique"
+    "*Smooth motion*: our default steps are implicit Euler, of first order; `second_order` is of second order there,"
+    " keeps what free motion keeps, and pays for contact with a second solve, for cloth with a stage. MuJoCo's RK4 is"
+    " of fourth order.",
+    "*Why implicit Euler is the default*: where things meet, the errors of `second_order` are the same (push, oblique"
     " impact), in heaps a step takes up to 4 times as long and makes up to 3e-4 of the energy that is lost where"
-    " implicit Euler makes none (pile), and cloth keeps implicit Euler in either. Where things fly, slide and roll,"
-    " `trapezoidal` is more exact by orders in the same time: use it there.",
+    " implicit Euler makes none (pile). Where things fly, slide and roll, and where cloth swings, `second_order` is"
+    " more exact by orders in the same time: use it there.",
     "*Friction*: a stack that leans, a box that has stopped and a ball that rolls should not creep or slip at all."
     " MuJoCo's friction gives way with a speed that impratio divides; ours is exact, and slips by rounding.",
 )
 REDUCED = "**A reduced run**: some steps of each sweep, which each scene names, and scenes of 10 s at most."
 GRADIENT_INTRODUCTION = (
     "`exact` keeps the curvature of contacts, `qr` and `dense` leave it out as the paper does and have no friction;"
-    " `trapezoidal` is `exact` with the other integrator. Differences are central; MuJoCo's are taken with two"
+    " `second_order` is `exact` with the other integrator. Differences are central; MuJoCo's are taken with two"
     " widths, of which the larger averages over what jumps from step to step. A gradient can be that of the steps"
     " that were run, and still not be useful: an impact falls into some step, and where in the step it falls changes"
     " with the inputs. The third plot of a scene shows whether that fades as dt falls; where it does not, a gradient"

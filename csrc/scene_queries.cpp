@@ -44,7 +44,7 @@ void check_separation(const Model& model, const Separation& separation, const Sc
 SceneState separate_state(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state) {
     Zone zone;
-    make_zone(zone, model, parameters.cloths, options.compliance, 0.0, Vec3::Zero());
+    make_zone(zone, model, parameters.cloths, options.compliance, Vec3::Zero());
     PassiveBodies passive;
     std::vector<Box> boxes;
     for (int i = 0; i < model.body_count(); ++i) {
@@ -68,7 +68,8 @@ SceneState separate_state(
         SceneControl control;
         control.node_force.assign(state.node_position.size(), Vec3::Zero());
         control.node_velocity = control.node_force;
-        for (int c = 0; c < model.cloth_count(); ++c) add_cloth(zone, c, state, control, parameters);
+        const StepSetting setting{model, parameters, 0.0, StepPart::whole};
+        for (int c = 0; c < model.cloth_count(); ++c) add_cloth(zone, c, setting, state, control);
     }
     if (zone.bodies.empty() && zone.nodes.empty()) return state;
     const Separation separation = separate(zone, passive);

@@ -63,9 +63,9 @@ class Simulator(SceneIdentity, Measurements):
         compliance: How far contacts give way: about this part of what gravity moves a body in one step. 0: not at all,
             at the price of a few more Newton steps (the quadratic program of Eq. 6 as written).
         adjoint: How gradients are computed: "exact" (with the contacts' curvature), "qr" or "dense" (the paper's).
-        integrator: "implicit_euler", of first order, or "trapezoidal", of second order where bodies move freely: a
-            projectile is exact and free spin keeps its energy. What is in contact has a second solve, and cloth keeps
-            implicit Euler (docs/conventions.md). Not with ``coupling="split"``.
+        integrator: "implicit_euler", of first order, or "second_order", of second order between impacts: a projectile
+            is exact, free spin keeps its energy, and cloth moves by an L-stable scheme of two stages. What is in
+            contact, and cloth, have more solves a step (docs/conventions.md). Not with ``coupling="split"``.
         coupling: "monolithic" or "split": whether cloth and what touches it are solved at once, or the cloth's elastic
             step first and its contacts after it, as the paper does. Without cloth the two are the same.
         zones: "local": bodies and cloths are solved together only if they may meet, the default. "global": all at once,
@@ -110,10 +110,10 @@ class Simulator(SceneIdentity, Measurements):
         where = "Simulator"
         check_instance(where, "scene", scene, Scene, "be a diffsim.Scene")
         check_choice(where, "adjoint", adjoint, ("exact", "qr", "dense"))
-        check_choice(where, "integrator", integrator, ("implicit_euler", "trapezoidal"))
+        check_choice(where, "integrator", integrator, ("implicit_euler", "second_order"))
         check_choice(where, "coupling", coupling, ("monolithic", "split"))
-        if integrator == "trapezoidal" and coupling == "split":
-            raise ValueError(f"{where}: integrator='trapezoidal' must be used with coupling='monolithic', got 'split'")
+        if integrator == "second_order" and coupling == "split":
+            raise ValueError(f"{where}: integrator='second_order' must be used with coupling='monolithic', got 'split'")
         check_choice(where, "zones", zones, ("local", "global"))
         check_choice(where, "on_failure", on_failure, ("warn", "raise"))
         compliance = check_number(where, "compliance", compliance, least=0.0)

@@ -220,6 +220,7 @@ void start_result(const Zone& zone, const Coordinates& upstream, ZoneAdjoint& re
     result.drive_gradient.assign_zero(zone.bodies.size(), zone.nodes.size());
     result.friction_gradient.clear();
     result.start_gradient.assign(zone.nodes.size(), Vec3::Zero());
+    result.first_stage_gradient.assign(zone.nodes.size(), Vec3::Zero());
     result.mass_gradient.assign(static_cast<std::size_t>(zone.dynamic_count), 0.0);
     result.node_mass_gradient.assign(zone.nodes.size(), 0.0);
     result.cloth_gradient.assign(zone.cloths.size(), ClothParameters{});
@@ -256,7 +257,8 @@ const ZoneAdjoint& zone_adjoint(
     if (!zone.cloths.empty() && zone.elastic)
         add_elastic_backward(
             zone, point, result.multiplier.nodes, needs.place, needs.material,
-            {result.pose_gradient.nodes, result.start_gradient, result.cloth_gradient});
+            {result.pose_gradient.nodes, result.start_gradient, result.drive_gradient.nodes,
+             result.first_stage_gradient, result.cloth_gradient});
     return result;
 }
 

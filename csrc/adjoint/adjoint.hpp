@@ -27,8 +27,8 @@ struct ZoneAdjoint {
     /// Through contacts and elasticity, when an object starts elsewhere and moves as it did: one per body of the zone,
     /// those that do not yield included, along its twist at the end of the step; one per node.
     Coordinates pose_gradient;
-    /// Through slips, when what moves as told goes further and ends where it did: one per body that does not yield and
-    /// pinned node, along its motion.
+    /// Through slips and strains between start and end, when what moves as told goes further and ends where it did: one
+    /// per body that does not yield and pinned node, along its motion.
     Coordinates drive_gradient;
     /// Of one object's coefficient of friction, through one contact.
     struct FrictionPart {
@@ -37,6 +37,7 @@ struct ZoneAdjoint {
     };
     std::vector<FrictionPart> friction_gradient;
     std::vector<Vec3> start_gradient;             ///< one per node: through the strains that damping is measured from
+    std::vector<Vec3> first_stage_gradient;       ///< one per node: of Straining::first_stage
     std::vector<double> mass_gradient;            ///< through the contacts' stiffness, one per dynamic body
     std::vector<double> node_mass_gradient;       ///< the same, one per node
     std::vector<ClothParameters> cloth_gradient;  ///< through elasticity, one per cloth of the zone

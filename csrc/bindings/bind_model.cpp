@@ -167,12 +167,12 @@ bool parse_zones(const std::string& text) {
 
 Integrator parse_integrator(const std::string& text) {
     if (text == "implicit_euler") return Integrator::implicit_euler;
-    if (text == "trapezoidal") return Integrator::trapezoidal;
-    throw std::invalid_argument("integrator must be 'implicit_euler' or 'trapezoidal', got '" + text + "'");
+    if (text == "second_order") return Integrator::second_order;
+    throw std::invalid_argument("integrator must be 'implicit_euler' or 'second_order', got '" + text + "'");
 }
 
 const char* integrator_text(Integrator integrator) {
-    return integrator == Integrator::trapezoidal ? "trapezoidal" : "implicit_euler";
+    return integrator == Integrator::second_order ? "second_order" : "implicit_euler";
 }
 
 const char* zones_text(bool global) { return global ? "global" : "local"; }

@@ -151,6 +151,14 @@ ElasticStart elastic_start(const Cloth& cloth, const Vec3* x_start) {
     return start;
 }
 
+ElasticStart extrapolated(const ElasticStart& from, const ElasticStart& to, double share) {
+    ElasticStart result = from;
+    for (std::size_t t = 0; t < from.strain.size(); ++t) result.strain[t] += share * (to.strain[t] - from.strain[t]);
+    for (std::size_t h = 0; h < from.angle.size(); ++h)
+        result.angle[h] += share * wrap_angle(to.angle[h] - from.angle[h]);
+    return result;
+}
+
 double elastic_energy(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x) {
     const ElasticLaw law = elastic_law(cloth, parameters, dt);

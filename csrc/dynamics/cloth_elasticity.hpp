@@ -6,8 +6,8 @@
 #include "geometry/dihedral.hpp"
 #include "model/cloth.hpp"
 
-/// The elastic potential of one cloth over one step of implicit Euler, with its derivatives. Nodes are those of the
-/// cloth, from 0; pins are the caller's business.
+/// The elastic potential of one cloth over one step of implicit Euler, or a stage that is one, with its derivatives.
+/// Nodes are those of the cloth, from 0; pins are the caller's business.
 ///
 /// Membrane, per triangle with deformation gradient F (3 x 2) and Green strain ε = ½ (FᵀF - 1):
 ///   W(ε) = ½ E / (1 - ν²) (ε11² + ε22² + 2 ν ε11 ε22) + ½ G (2 ε12)²,  times the area at rest,
@@ -32,6 +32,9 @@ struct ElasticStart {
 
 ElasticStart elastic_start(const Cloth& cloth, const Vec3* x_start);
 
+/// The strains `from` and so many times how they differ at `to`.
+ElasticStart extrapolated(const ElasticStart& from, const ElasticStart& to, double share);
+
 /// [J]
 double elastic_energy(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x);
@@ -49,7 +52,7 @@ void add_elastic_hessian_product(
 /// Gradient of  s = scale * direction · d(energy)/dx  with respect to what the energy depends on besides x: added to
 /// grad_x_start through the start's strains, and returned for the parameters (density's is 0). With respect to x
 /// it is the Hessian product; with respect to dt it is -damping / dt times that with respect to damping.
-/// `start` is elastic_start(cloth, x_start).
+/// `start` depends on x_start as elastic_start(cloth, x_start) does.
 ClothParameters add_elastic_backward(
     const Cloth& cloth, const ClothParameters& parameters, double dt, const ElasticStart& start, const Vec3* x,
     const Vec3* x_start, const Vec3* direction, double scale, Vec3* grad_x_start);

@@ -69,10 +69,11 @@ struct Model {
 enum class AdjointMode { exact, qr, dense };
 
 /// The time scheme, see step/step.hpp.
-enum class Integrator { implicit_euler, trapezoidal };
+enum class Integrator { implicit_euler, second_order };
 
-/// What a solve is for: with implicit Euler the whole step, else the new velocities or the new places.
-enum class StepPart { whole, velocities, places };
+/// What a solve is for: with implicit Euler the whole step; else the first stage of cloth, the new velocities or the
+/// new places.
+enum class StepPart { whole, first_stage, velocities, places };
 
 /// Contacts give way to a resting body's weight by about this part of what gravity moves it in a step.
 inline constexpr double kDefaultCompliance = 1e-4;

@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "zone/contacts.hpp"
+#include "zone/elasticity.hpp"
 #include "zone/motion_bounds.hpp"
 #include "zone/sides_of.hpp"
 
@@ -176,11 +177,7 @@ void ModelDirection::make_model() {
         any = any || !driven[i].isZero(0.0);
     }
     if (!any) return;
-    for (const ZoneCloth& cloth : m_zone.cloths)
-        add_elastic_hessian_product(
-            m_zone.model->cloths[cloth.id], (*m_zone.cloth_parameters)[cloth.id], m_zone.dt, cloth.start,
-            m_point.nodes.data() + cloth.first_node, driven.data() + cloth.first_node, m_zone.dt * m_zone.dt,
-            m_model.gradient.nodes.data() + cloth.first_node);
+    add_elastic_product(m_zone, m_point, driven, m_model.gradient.nodes);
     for (int i = 0; i < m_zone.node_count(); ++i)
         if (m_zone.nodes[i].pinned) m_model.gradient.nodes[i].setZero();
 }

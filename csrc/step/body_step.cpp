@@ -21,7 +21,7 @@ Vec3 free_velocity(const StepSetting& setting, int id, const BodyState& state, c
 /// How a body turns that nothing touches. Where the step is for velocities it turns by dt w1, if that is an angle at
 /// all, so that what contact leaves of the turn is the velocity it leaves.
 FreeRotation free_turn(const StepSetting& setting, int id, const BodyState& state, const BodyControl& control) {
-    const auto solve = setting.part == StepPart::whole ? free_rotation : conserving_rotation;
+    const auto solve = setting.by_implicit_euler() ? free_rotation : conserving_rotation;
     FreeRotation result = solve(
         quaternion_to_matrix(state.orientation), state.angular_velocity, control.torque, setting.parameters.inertia[id],
         setting.dt);
@@ -37,7 +37,7 @@ FreeRotationGradient free_turn_backward(
         grad_angular_velocity += setting.dt * grad_rotation;
         grad_rotation.setZero();
     }
-    const auto backward = setting.part == StepPart::whole ? free_rotation_backward : conserving_rotation_backward;
+    const auto backward = setting.by_implicit_euler() ? free_rotation_backward : conserving_rotation_backward;
     return backward(
         quaternion_to_matrix(state.orientation), state.angular_velocity, control.torque, setting.parameters.inertia[id],
         setting.dt, rotation, grad_angular_velocity, grad_rotation, with_inertia);

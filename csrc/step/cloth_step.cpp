@@ -2,6 +2,8 @@
 
 #include <utility>
 
+#include "dynamics/two_stages.hpp"
+
 namespace diffsim {
 namespace {
 
@@ -10,27 +12,76 @@ Vec3 free_node_velocity(const Vec3& velocity, const Vec3& force, double mass, co
     return velocity + dt * (parameters.gravity + force / mass);
 }
 
+/// How far a node goes in two stages, of which the second has dt times this velocity.
+Vec3 place_by_velocity(const StepSetting& setting, int node, const SceneState& state, const Vec3& dt_velocity) {
+    return kFirstStageShare * ((*setting.first_stage)[node] - state.node_position[node]) + kStage * dt_velocity;
+}
+
+/// How the step strains a cloth.
+Straining straining_of(const StepSetting& setting, const Cloth& cloth, const SceneState& state, const Vec3& origin) {
+    const double dt = setting.dt;
+    Straining result;
+    result.start = elastic_start(cloth, state.node_position.data() + cloth.first_node);
+    result.scale = dt * dt;
+    result.time = dt;
+    if (!setting.after_first_stage()) return result;
+    const Vec3* first_stage = setting.first_stage->data() + cloth.first_node;
+    for (int k = 0; k < cloth.node_count(); ++k) result.first_stage.push_back(first_stage[k] - origin);
+    result.time = kStage * dt;
+    result.start_share = kFirstStageShare;
+    result.start = extrapolated(result.start, elastic_start(cloth, first_stage), kFirstStageShare);
+    if (setting.part == StepPart::velocities) {
+        result.share = kStage;
+        result.base_share = kFirstStageShare;
+    } else {
+        result.scale = kStage * dt * dt;
+    }
+    return result;
+}
+
+/// The elastic and damping forces at the end of the first stage, turned round [N].
+std::vector<Vec3> first_stage_forces(const StepSetting& setting, const Cloth& cloth, int id, const SceneState& state) {
+    std::vector<Vec3> forces(static_cast<std::size_t>(cloth.node_count()), Vec3::Zero());
+    add_elastic_gradient(
+        cloth, setting.parameters.cloths[id], kStage * setting.dt,
+        elastic_start(cloth, state.node_position.data() + cloth.first_node),
+        setting.first_stage->data() + cloth.first_node, 1.0, forces.data());
+    return forces;
+}
+
 }  // namespace
 
-void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters) {
-    const Cloth& cloth = zone.model->cloths[id];
+void add_cloth(Zone& zone, int id, const StepSetting& setting, const SceneState& state, const SceneControl& control) {
+    const Cloth& cloth = setting.model.cloths[id];
+    const double dt = setting.dt;
     ZoneCloth entry;
     entry.id = id;
     entry.first_node = zone.node_count();
-    entry.start = elastic_start(cloth, state.node_position.data() + cloth.first_node);
+    entry.straining = straining_of(setting, cloth, state, zone.origin);
     zone.cloths.push_back(std::move(entry));
+    const bool two_stages = setting.after_first_stage();
+    const std::vector<Vec3> forces = two_stages ? first_stage_forces(setting, cloth, id, state) : std::vector<Vec3>();
     for (int k = 0; k < cloth.node_count(); ++k) {
         const int i = cloth.first_node + k;
         ZoneNode node;
         node.start = state.node_position[i] - zone.origin;
-        node.mass = parameters.cloths[id].density * cloth.node_area[k];
+        node.weight = setting.node_weight();
+        const double mass = setting.parameters.cloths[id].density * cloth.node_area[k];
+        node.mass = node.weight * mass;
         node.pinned = cloth.pinned[k] != 0;
-        const Vec3 velocity =
-            node.pinned
-                ? control.node_velocity[i]
-                : free_node_velocity(state.node_velocity[i], control.node_force[i], node.mass, parameters, zone.dt);
-        node.target = zone.dt * velocity;
-        node.last_motion = zone.dt * state.node_velocity[i];
+        node.last_motion = dt * state.node_velocity[i];
+        if (node.pinned) {
+            node.target = dt * control.node_velocity[i];
+        } else {
+            node.target =
+                dt * free_node_velocity(state.node_velocity[i], control.node_force[i], mass, setting.parameters, dt);
+            if (two_stages) node.target -= (1.0 - kStage) * dt * dt / mass * forces[static_cast<std::size_t>(k)];
+            if (setting.part == StepPart::places && two_stages) {
+                node.target = place_by_velocity(setting, i, state, node.target);
+                if (setting.end_velocity != nullptr && !setting.end_velocity->empty())
+                    node.last_motion = place_by_velocity(setting, i, state, dt * (*setting.end_velocity)[i]);
+            }
+        }
         zone.nodes.push_back(node);
     }
 }
@@ -102,12 +153,13 @@ void ClothBackward::finish(const Zone& zone, const ZoneAdjoint& adjoint) {
                     model.first_node + k, pose, adjoint.start_gradient[node], adjoint.drive_gradient.nodes[node]);
                 continue;
             }
-            const Vec3 error = m_y.nodes[model.first_node + k] - zone.nodes[node].target;
+            const Vec3 error = zone.nodes[node].weight * (m_y.nodes[model.first_node + k] - zone.nodes[node].target);
             free_node(
                 cloth.id, k, adjoint.multiplier.nodes[node], error, adjoint.node_mass_gradient[node],
                 pose + adjoint.start_gradient[node]);
         }
         add_material(cloth.id, adjoint.cloth_gradient[c]);
+        if (m_setting.after_first_stage()) add_first_stage(zone, adjoint, cloth);
     }
 }
 
@@ -117,10 +169,9 @@ void ClothBackward::start_elastic_pass(
     const Zone& contact_zone, const ZoneAdjoint& contact, const ZoneCloth& cloth,
     const std::vector<Vec3>& elastic_shift, Zone& zone, ZonePoint& point, Coordinates& upstream) {
     const Cloth& model = m_setting.model.cloths[cloth.id];
-    make_zone(
-        zone, m_setting.model, m_setting.parameters.cloths, kDefaultCompliance, m_setting.dt, contact_zone.origin);
+    make_zone(zone, m_setting.model, m_setting.parameters.cloths, kDefaultCompliance, contact_zone.origin);
     zone.contacts_off = true;
-    add_cloth(zone, cloth.id, m_start, m_control, m_setting.parameters);
+    add_cloth(zone, cloth.id, m_setting, m_start, m_control);
     for (int k = 0; k < model.node_count(); ++k) {
         const int node = cloth.first_node + k, id = model.first_node + k;
         const Vec3& z = contact.multiplier.nodes[node];
@@ -165,6 +216,35 @@ void ClothBackward::add_material(int cloth, const ClothParameters& gradient) {
     sum.shear += gradient.shear;
     sum.bend += gradient.bend;
     sum.damping += gradient.damping;
+}
+
+/// What reaches the first stage: through strains, through the forces at its end, which targets have a part of, and
+/// through how far it went.
+void ClothBackward::add_first_stage(const Zone& zone, const ZoneAdjoint& adjoint, const ZoneCloth& cloth) {
+    const Cloth& model = m_setting.model.cloths[cloth.id];
+    const ClothParameters& parameters = m_setting.parameters.cloths[cloth.id];
+    const std::size_t first = static_cast<std::size_t>(cloth.first_node);
+    const double dt = m_setting.dt, scale = -(1.0 - kStage) * dt * dt;
+    const Vec3 *x0 = m_start.node_position.data() + model.first_node,
+               *x1 = m_setting.first_stage->data() + model.first_node, *z = adjoint.multiplier.nodes.data() + first;
+    Vec3* of_x0 = m_gradient.node_position.data() + model.first_node;
+    Vec3* of_x1 = m_first_stage_gradient->data() + model.first_node;
+    const ElasticStart start = elastic_start(model, x0);
+    const std::vector<Vec3> forces = first_stage_forces(m_setting, model, cloth.id, m_start);
+    for (int k = 0; k < model.node_count(); ++k) {
+        of_x1[k] += adjoint.first_stage_gradient[first + static_cast<std::size_t>(k)];
+        const ZoneNode& node = zone.nodes[first + static_cast<std::size_t>(k)];
+        if (node.pinned) continue;
+        const double mass = node.mass / node.weight;
+        m_parameter_gradient.cloths[cloth.id].density -=
+            scale / mass * forces[static_cast<std::size_t>(k)].dot(z[k]) * model.node_area[k];
+        if (m_setting.part != StepPart::places) continue;
+        const Vec3 way = kFirstStageShare * node.mass * z[k];
+        of_x1[k] += way;
+        of_x0[k] -= way;
+    }
+    add_elastic_hessian_product(model, parameters, kStage * dt, start, x1, z, scale, of_x1);
+    add_material(cloth.id, add_elastic_backward(model, parameters, kStage * dt, start, x1, x0, z, scale, of_x0));
 }
 
 /// A free node with multiplier z of m (u - target) + ... = 0, target = dt (v0 + dt (g + f / m)).

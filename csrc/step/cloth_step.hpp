@@ -6,11 +6,12 @@
 #include "step/step_setting.hpp"
 #include "zone/zone.hpp"
 
-/// The time scheme of one cloth: how its step begins, how it ends, and the backward of both. Implicit Euler.
+/// The time scheme of one cloth: how its step begins, how it ends, and the backward of both. Implicit Euler, or the
+/// second of two stages (dynamics/two_stages.hpp) where the setting knows of a first.
 namespace diffsim {
 
-/// Append a cloth at the start of a step to a zone, whose origin and dt are set.
-void add_cloth(Zone& zone, int id, const SceneState& state, const SceneControl& control, const Parameters& parameters);
+/// Append a cloth at the start of a step to a zone, whose origin is set.
+void add_cloth(Zone& zone, int id, const StepSetting& setting, const SceneState& state, const SceneControl& control);
 
 /// The cloth's part of the state after the motion `shift`, one per node of the scene. `as_told`: nothing was held up,
 /// and pinned nodes have the velocity they were given.
@@ -34,17 +35,19 @@ Vec3 node_upstream(const SceneStateGradient& end, int node, double dt);
 class ClothBackward {
 public:
     /// `start`, `y`: state at the start of the step, and its motion. `gradient` is
-    /// overwritten, the last two are added to.
+    /// overwritten, the last two are added to, and so is that of the setting's first stage, if it has one.
     ClothBackward(
         const StepSetting& setting, const SceneState& start, const SceneControl& control, const Coordinates& y,
-        SceneStateGradient& gradient, SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient)
+        SceneStateGradient& gradient, SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient,
+        std::vector<Vec3>* first_stage_gradient)
         : m_setting(setting),
           m_start(start),
           m_control(control),
           m_y(y),
           m_gradient(gradient),
           m_control_gradient(control_gradient),
-          m_parameter_gradient(parameter_gradient) {}
+          m_parameter_gradient(parameter_gradient),
+          m_first_stage_gradient(first_stage_gradient) {}
 
     /// The cloths of a zone that was solved at once.
     void finish(const Zone& zone, const ZoneAdjoint& adjoint);
@@ -60,6 +63,7 @@ private:
         const Zone& contact_zone, const ZoneAdjoint& contact, const ZoneCloth& cloth,
         const std::vector<Vec3>& elastic_shift, Zone& zone, ZonePoint& point, Coordinates& upstream);
     void add_material(int cloth, const ClothParameters& gradient);
+    void add_first_stage(const Zone& zone, const ZoneAdjoint& adjoint, const ZoneCloth& cloth);
     void free_node(int cloth, int k, const Vec3& z, const Vec3& error, double mass_gradient, const Vec3& pose);
     void pinned_node(int node, const Vec3& pose, const Vec3& start, const Vec3& drive);
 
@@ -70,6 +74,7 @@ private:
     SceneStateGradient& m_gradient;
     SceneControlGradient& m_control_gradient;
     ParameterGradient& m_parameter_gradient;
+    std::vector<Vec3>* m_first_stage_gradient;  // one per node of the scene
 };
 
 }  // namespace diffsim

@@ -88,7 +88,7 @@ GroupOutcome GroupStep::solve(
 ZoneResult GroupStep::solve_elastic(int cloth, ZoneMemory& memory) const {
     Zone& zone = new_zone(memory, m_state.node_position[m_model.cloths[cloth].first_node]);
     zone.contacts_off = true;
-    add_cloth(zone, cloth, m_state, m_control, m_parameters);
+    add_cloth(zone, cloth, m_setting, m_state, m_control);
     ZoneOptions options = zone_options();
     options.full_steps = m_options.newton_iterations;
     return solve_zone(zone, PassiveBodies(), options, memory.workspace, memory.swept);
@@ -100,7 +100,7 @@ ZoneOptions GroupStep::zone_options() const {
 
 /// The memory's zone, empty.
 Zone& GroupStep::new_zone(ZoneMemory& memory, const Vec3& origin) const {
-    return make_zone(memory.zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
+    return make_zone(memory.zone, m_model, m_parameters.cloths, m_options.compliance, origin);
 }
 
 /// Let a group's objects join its zone.
@@ -108,7 +108,7 @@ void GroupStep::join(
     const ObjectGroup& group, const std::vector<int>& members, const Objects& objects, Zone& zone) const {
     for (int k = group.first; k < group.end; ++k) {  // sorted: bodies come before cloths
         if (m_model.is_cloth(members[k])) {
-            add_cloth(zone, members[k] - m_model.body_count(), m_state, m_control, m_parameters);
+            add_cloth(zone, members[k] - m_model.body_count(), m_setting, m_state, m_control);
             continue;
         }
         zone.bodies.push_back(objects.bodies[members[k]]);

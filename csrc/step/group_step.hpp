@@ -25,11 +25,12 @@ std::uint64_t mix(std::uint64_t hash, std::uint64_t value);
 class GroupStep {
 public:
     GroupStep(
-        const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
-        const SceneControl& control, Interrupt* interrupt)
-        : m_model(model),
+        const StepSetting& setting, const Options& options, const SceneState& state, const SceneControl& control,
+        Interrupt* interrupt)
+        : m_setting(setting),
+          m_model(setting.model),
           m_options(options),
-          m_parameters(parameters),
+          m_parameters(setting.parameters),
           m_state(state),
           m_control(control),
           m_interrupt(interrupt) {}
@@ -61,6 +62,7 @@ private:
         const Objects& objects) const;
     [[noreturn]] void refuse_start(const ZoneContact& contact, double distance) const;
 
+    const StepSetting m_setting;
     const Model& m_model;
     const Options& m_options;
     const Parameters& m_parameters;

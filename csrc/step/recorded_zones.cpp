@@ -72,7 +72,7 @@ void RecordedZones::add_objects(
         first.body < end.body
             ? m_record.start.bodies[m_record.zones.bodies[first.body]].position
             : m_record.start.node_position[m_model.cloths[m_record.zones.cloths[first.cloth]].first_node];
-    make_zone(zone, m_model, m_parameters.cloths, m_options.compliance, m_options.dt, origin);
+    make_zone(zone, m_model, m_parameters.cloths, m_options.compliance, origin);
     zone.elastic = !m_options.split;
     if (!m_parameters.friction.empty()) zone.friction = &m_parameters.friction;
     memory.workspace.point.y.resize(0, 0);
@@ -86,9 +86,7 @@ void RecordedZones::join_body(ZoneMemory& memory, std::vector<int>& local, int i
     ZoneBody body;
     body.id = id;
     if (m_model.bodies[id].is_dynamic()) {
-        body = moving_body(
-            {m_model, m_parameters, m_options.dt, m_options.part}, id, state, m_control.bodies[id],
-            m_record.free_rotation[id]);
+        body = moving_body(m_setting, id, state, m_control.bodies[id], m_record.free_rotation[id]);
     } else {
         body.start = {quaternion_to_matrix(state.orientation), state.position};
         body.target = m_record.y.bodies[id];
@@ -103,7 +101,7 @@ void RecordedZones::join_cloth(ZoneMemory& memory, std::vector<int>& local, int 
     const Cloth& cloth = m_model.cloths[id];
     Zone& zone = memory.zone;
     local[m_model.body_count() + id] = static_cast<int>(zone.cloths.size());
-    add_cloth(zone, id, m_record.start, m_control, m_parameters);
+    add_cloth(zone, id, m_setting, m_record.start, m_control);
     const int first = zone.cloths.back().first_node;
     for (int k = 0; k < cloth.node_count(); ++k) {
         memory.workspace.point.y.nodes.push_back(m_record.y.nodes[cloth.first_node + k]);

@@ -5,13 +5,24 @@
 /// Zones of a recorded step, for its backward.
 namespace diffsim {
 
+/// What the schemes were given in a recorded step; keeps references to all it is given.
+inline StepSetting setting_of(
+    const Model& model, const Options& options, const Parameters& parameters, const StepRecord& record) {
+    return {model, parameters, options.dt, options.part, &record.first_stage};
+}
+
 /// The zones of a step that was taken, put together again from its record. Keeps references to all it is given.
 class RecordedZones {
 public:
     RecordedZones(
         const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
         const StepRecord& record)
-        : m_model(model), m_options(options), m_parameters(parameters), m_control(control), m_record(record) {}
+        : m_model(model),
+          m_options(options),
+          m_parameters(parameters),
+          m_control(control),
+          m_record(record),
+          m_setting(setting_of(model, options, parameters, record)) {}
 
     int count() const { return static_cast<int>(m_record.zones.body_end.size()); }
 
@@ -35,6 +46,7 @@ private:
     const Parameters& m_parameters;
     const SceneControl& m_control;
     const StepRecord& m_record;
+    const StepSetting m_setting;
 };
 
 }  // namespace diffsim

@@ -58,17 +58,17 @@ namespace {
 class Stepper {
 public:
     Stepper(
-        const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
-        const SceneControl& control, StepWorkspace& workspace, StepInfo& info)
-        : m_model(model),
+        const StepSetting& setting, const Options& options, const SceneState& state, const SceneControl& control,
+        StepWorkspace& workspace, StepInfo& info)
+        : m_model(setting.model),
           m_options(options),
           m_state(state),
           m_control(control),
           m_workspace(workspace),
           m_scratch(*workspace.forward),
           m_info(info),
-          m_setting{model, parameters, options.dt, options.part},
-          m_group_step(model, options, parameters, state, control, workspace.interrupt) {}
+          m_setting(setting),
+          m_group_step(setting, options, state, control, workspace.interrupt) {}
 
     SceneState run(StepRecord* record) {
         m_info = StepInfo{};
@@ -290,16 +290,24 @@ private:
     void solve_group(const ObjectGroup& group, int thread) {
         ThreadMemory& own = m_workspace.memory(thread);
         GroupOutcome& outcome = m_scratch.outcomes[group.root];
-        if (moves_freely(group, own.near)) {
+        if (is_not_asked_for(group) || moves_freely(group, own.near)) {
             outcome = GroupOutcome{};
-            m_scratch.y.bodies[group.root] = m_scratch.bodies[group.root].target;
-            m_scratch.swept[group.root] = m_scratch.groups.space(group.root);
+            for (int k = group.first; k < group.end; ++k) {
+                const int body = m_scratch.groups.members()[k];
+                m_scratch.y.bodies[body] = m_scratch.bodies[body].target;
+                m_scratch.swept[body] = m_scratch.groups.space(body);
+            }
             return;
         }
         outcome = m_group_step.solve(
             group, m_scratch.groups.members(),
             {m_scratch.bodies, m_scratch.elastic_shift, m_scratch.passive, m_scratch.y, m_scratch.swept}, own);
         outcome.thread = thread;
+    }
+
+    /// A first stage is for cloth.
+    bool is_not_asked_for(const ObjectGroup& group) const {
+        return m_setting.part == StepPart::first_stage && !m_model.is_cloth(m_scratch.groups.members()[group.end - 1]);
     }
 
     bool moves_freely(const ObjectGroup& group, std::vector<int>& near) const {
@@ -399,6 +407,7 @@ private:
         record.y = m_scratch.y;
         record.zones = m_scratch.zones;
         if (m_options.split) record.elastic_shift = m_scratch.elastic_shift;
+        if (m_setting.after_first_stage()) record.first_stage = *m_setting.first_stage;
     }
 
     const Model& m_model;
@@ -439,15 +448,15 @@ std::size_t StepRecord::bytes() const {
     return sizeof(*this) + start.bodies.capacity() * sizeof(BodyState) +
            free_rotation.capacity() * sizeof(FreeRotation) + y.bodies.capacity() * sizeof(Vec6) +
            (start.node_position.capacity() + start.node_velocity.capacity() + y.nodes.capacity() +
-            elastic_shift.capacity()) *
+            elastic_shift.capacity() + first_stage.capacity()) *
                sizeof(Vec3) +
-           zones.bytes() + (velocities ? velocities->bytes() : 0);
+           zones.bytes() + (velocities ? velocities->bytes() : 0) + (stage ? stage->bytes() : 0);
 }
 
 SceneState solve_part(
-    const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
-    const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record) {
-    return Stepper(model, options, parameters, state, control, workspace, info).run(record);
+    const StepSetting& setting, const Options& options, const SceneState& state, const SceneControl& control,
+    StepWorkspace& workspace, StepInfo& info, StepRecord* record) {
+    return Stepper(setting, options, state, control, workspace, info).run(record);
 }
 
 SceneState hold(

@@ -19,13 +19,16 @@
 /// One time step and its backward: the only place that knows the whole order.
 ///
 /// With implicit Euler a step is one solve: y is the minimiser of [zone/zone.hpp] for targets ŷ = dt v̂, v̂
-/// the velocity at the end of free motion, and the new velocities are y / dt. The trapezoidal scheme has
-/// two solves from the same start:
+/// the velocity at the end of free motion, and the new velocities are y / dt. The scheme of second order has, of bodies
+/// that move by the trapezoidal rule, two solves from the same start:
 ///  * velocities: that of implicit Euler, whose y / dt are the new velocities, so that contact is inelastic, what rests
 ///    has none, and momentum is kept among bodies in contact;
 ///  * places: targets ŷ = dt (v0 + v̂) / 2, bodies of double weight. What contact does to places is then dt² f / (2 m),
 ///    as what gravity does is dt² g / 2; forces, and compressions at rest, are those of the other solve.
-/// Cloth has the targets of implicit Euler in both.
+/// Cloth moves by two stages (dynamics/two_stages.hpp). The first is a step of implicit Euler over γ dt of all that may
+/// meet cloth, its contacts as stiff as in the others; the second is solved with the bodies, once for velocities and
+/// once for places, and has the forces of cloth alone from the first: those of contact it finds again, or an impact in
+/// the first stage would bounce in the second.
 namespace diffsim {
 
 /// What the backward of a step needs: O(bodies + contacts).
@@ -36,8 +39,10 @@ struct StepRecord {
     Coordinates y;                            ///< the motion of the step: (turn, shift) per body, shift per node
     std::vector<Vec3> elastic_shift;          ///< per node: its motion without contact; with split coupling only
     TouchingZones zones;
-    /// Of a trapezoidal step that has two parts: this one is of the places then.
-    std::unique_ptr<StepRecord> velocities;
+    std::vector<Vec3>
+        first_stage;  ///< per node: where it was at the end of the first stage; empty where there was none
+    // Of a step that has several parts; this one is of the places then.
+    std::unique_ptr<StepRecord> velocities, stage;
 
     std::size_t bytes() const;
 };

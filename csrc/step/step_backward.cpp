@@ -27,10 +27,11 @@ public:
     StepBackward(
         const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
         const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
-        SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient)
+        SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient,
+        std::vector<Vec3>* first_stage_gradient)
         : m_model(model),
           m_options(options),
-          m_setting{model, parameters, options.dt, options.part},
+          m_setting(setting_of(model, options, parameters, record)),
           m_control(control),
           m_record(record),
           m_zones(model, options, parameters, control, record),
@@ -39,7 +40,8 @@ public:
           m_scratch(*workspace.backward),
           m_gradient(gradient),
           m_control_gradient(control_gradient),
-          m_parameter_gradient(parameter_gradient) {}
+          m_parameter_gradient(parameter_gradient),
+          m_first_stage_gradient(first_stage_gradient) {}
 
     void run() {
         if (m_record.held) return;
@@ -152,7 +154,8 @@ private:
         }
         if (zone.cloths.empty()) return;
         ClothBackward cloths(
-            m_setting, m_record.start, m_control, m_record.y, m_gradient, m_control_gradient, m_parameter_gradient);
+            m_setting, m_record.start, m_control, m_record.y, m_gradient, m_control_gradient, m_parameter_gradient,
+            m_first_stage_gradient);
         if (m_options.split)
             cloths.finish_split(zone, adjoint, m_record.elastic_shift, m_options.adjoint, m_needs, scratch.elastic);
         else
@@ -171,6 +174,7 @@ private:
     SceneStateGradient& m_gradient;
     SceneControlGradient& m_control_gradient;
     ParameterGradient& m_parameter_gradient;
+    std::vector<Vec3>* m_first_stage_gradient;
 };
 
 }  // namespace
@@ -178,10 +182,12 @@ private:
 void part_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
-    SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
+    SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient,
+    std::vector<Vec3>* first_stage_gradient) {
     if (!workspace.backward) workspace.backward = std::make_shared<StepWorkspace::BackwardScratch>();
     StepBackward(
-        model, options, parameters, control, record, needs, workspace, gradient, control_gradient, parameter_gradient)
+        model, options, parameters, control, record, needs, workspace, gradient, control_gradient, parameter_gradient,
+        first_stage_gradient)
         .run();
 }
 

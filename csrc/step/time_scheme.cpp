@@ -3,6 +3,7 @@
 #include <memory>
 #include <utility>
 
+#include "dynamics/two_stages.hpp"
 #include "step/group_step.hpp"
 #include "step/step.hpp"
 #include "step/step_part.hpp"
@@ -10,15 +11,19 @@
 namespace diffsim {
 namespace {
 
-/// Without bodies both parts of a step would be the same.
-bool in_two_parts(const Model& model, const Options& options) {
-    return options.integrator == Integrator::trapezoidal &&
-           std::any_of(model.bodies.begin(), model.bodies.end(), [](const Body& body) { return body.is_dynamic(); });
+/// Without cloth or bodies that yield all schemes are the same.
+bool in_parts(const Model& model, const Options& options) {
+    const auto yields = [](const Body& body) { return body.is_dynamic(); };
+    return options.integrator == Integrator::second_order &&
+           (model.cloth_count() > 0 || std::any_of(model.bodies.begin(), model.bodies.end(), yields));
 }
 
 Options for_part(const Options& options, StepPart part) {
     Options result = options;
     result.part = part;
+    if (part != StepPart::first_stage) return result;
+    result.dt = kStage * options.dt;
+    result.compliance = options.compliance / (kStage * kStage);  // its unit has the step in it
     return result;
 }
 
@@ -61,6 +66,14 @@ SceneStateGradient split_off_velocities(SceneStateGradient& gradient) {
     return velocities;
 }
 
+SceneStateGradient zero_like(const SceneStateGradient& gradient) {
+    SceneStateGradient result;
+    result.bodies.resize(gradient.bodies.size());
+    result.node_position.assign(gradient.node_position.size(), Vec3::Zero());
+    result.node_velocity = result.node_position;
+    return result;
+}
+
 void add_to(SceneStateGradient& sum, const SceneStateGradient& part) {
     for (std::size_t i = 0; i < sum.bodies.size(); ++i) {
         sum.bodies[i].position += part.bodies[i].position;
@@ -79,22 +92,38 @@ void add_to(SceneStateGradient& sum, const SceneStateGradient& part) {
 SceneState step(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record) {
-    if (!in_two_parts(model, options))
-        return solve_part(model, options, parameters, state, control, workspace, info, record);
+    std::vector<Vec3> first_stage;
+    SceneState velocities;
     const auto solve = [&](StepPart part, StepInfo& part_info, StepRecord* part_record) {
+        const Options of_part = for_part(options, part);
         return solve_part(
-            model, for_part(options, part), parameters, state, control, workspace, part_info, part_record);
+            {model, parameters, of_part.dt, part, &first_stage, &velocities.node_velocity}, of_part, state, control,
+            workspace, part_info, part_record);
     };
-    StepInfo velocity_info;
-    std::unique_ptr<StepRecord> velocity_record = record != nullptr ? std::make_unique<StepRecord>() : nullptr;
-    const SceneState velocities = solve(StepPart::velocities, velocity_info, velocity_record.get());
-    if (velocity_info.status == StepStatus::overflow)
-        return hold(state, StepStatus::overflow, velocity_info.failed_objects, info, record);
+    if (!in_parts(model, options)) return solve(StepPart::whole, info, record);
+    const auto new_record = [&] { return record != nullptr ? std::make_unique<StepRecord>() : nullptr; };
+    std::unique_ptr<StepRecord> stage_record, velocity_record = new_record();
+    StepInfo stage_info, velocity_info;
+    const auto overflown = [](const StepInfo& part) { return part.status == StepStatus::overflow; };
+    const auto hold_all = [&](const StepInfo& part) {
+        return hold(state, StepStatus::overflow, part.failed_objects, info, record);
+    };
+    if (model.cloth_count() > 0) {
+        stage_record = new_record();
+        SceneState end = solve(StepPart::first_stage, stage_info, stage_record.get());
+        if (overflown(stage_info)) return hold_all(stage_info);
+        first_stage = std::move(end.node_position);
+    }
+    velocities = solve(StepPart::velocities, velocity_info, velocity_record.get());
+    if (overflown(velocity_info)) return hold_all(velocity_info);
     SceneState result = solve(StepPart::places, info, record);
-    if (info.status == StepStatus::overflow) return result;
+    if (overflown(info)) return result;
     take_velocities(velocities, result);
     add_info(velocity_info, info);
-    if (record != nullptr) record->velocities = std::move(velocity_record);
+    if (model.cloth_count() > 0) add_info(stage_info, info);
+    if (record == nullptr) return result;
+    record->velocities = std::move(velocity_record);
+    record->stage = std::move(stage_record);
     return result;
 }
 
@@ -102,16 +131,26 @@ void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
-    const auto backward = [&](const Options& part, const StepRecord& part_record, SceneStateGradient& part_gradient) {
+    std::vector<Vec3> of_first_stage(record.first_stage.size(), Vec3::Zero());
+    const auto backward = [&](StepPart part, const StepRecord& part_record, SceneStateGradient& part_gradient) {
+        GradientNeeds part_needs = needs;
+        part_needs.place =
+            needs.place || !part_record.first_stage.empty();  // it leads to what the first stage depends on
         part_backward(
-            model, part, parameters, control, part_record, needs, workspace, part_gradient, control_gradient,
-            parameter_gradient);
+            model, for_part(options, part), parameters, control, part_record, part_needs, workspace, part_gradient,
+            control_gradient, parameter_gradient, &of_first_stage);
     };
-    if (!record.velocities) return backward(options, record, gradient);
+    if (!record.velocities) return backward(StepPart::whole, record, gradient);
     SceneStateGradient velocities = split_off_velocities(gradient);
-    backward(for_part(options, StepPart::places), record, gradient);
-    backward(for_part(options, StepPart::velocities), *record.velocities, velocities);
+    SceneStateGradient stage;
+    if (record.stage) stage = zero_like(gradient);
+    backward(StepPart::places, record, gradient);
+    backward(StepPart::velocities, *record.velocities, velocities);
     add_to(gradient, velocities);
+    if (!record.stage) return;
+    stage.node_position = std::move(of_first_stage);
+    backward(StepPart::first_stage, *record.stage, stage);
+    add_to(gradient, stage);
 }
 
 }  // namespace diffsim

@@ -56,11 +56,11 @@ public:
             if (node >= 0) node += m_zone.cloths[m_cloth].first_node;
         return nodes;
     }
-    /// Sum of its nodes' masses.
+    /// Sum of its nodes' own masses.
     double mass() const {
         double mass = 0.0;
         for (int node : nodes())
-            if (node >= 0) mass += m_zone.nodes[node].mass;
+            if (node >= 0) mass += m_zone.nodes[node].mass / m_zone.nodes[node].weight;
         return mass;
     }
     Surface surface(const std::vector<Pose>&, const std::vector<Vec3>& nodes) const {

@@ -14,8 +14,7 @@ Pose pose_at(const ZoneBody& body, const Vec6& y) {
 }
 
 Zone& make_zone(
-    Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
-    const Vec3& origin) {
+    Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, const Vec3& origin) {
     zone.nodes.clear();
     zone.cloths.clear();
     zone.dynamic_count = 0;
@@ -25,7 +24,6 @@ Zone& make_zone(
     zone.exact_contact = compliance == 0.0;
     zone.compliance = zone.exact_contact ? kDefaultCompliance : compliance;
     forget_contacts(zone);
-    zone.dt = dt;
     zone.origin = origin;
     zone.ground_height = model.ground.height - origin.z();
     zone.elastic = true;

@@ -14,7 +14,8 @@
 /// from the world's. A cloth node has the coordinates y = u around its position at the start. The step is the minimiser
 /// of [Qiao et al. 2020, Eqs. 2 and 6 together, with contact as an energy]
 ///     E(y) = ½ (y - ŷ)ᵀ M (y - ŷ) + dt² Ψ(y) + Σ contact energies,   M = diag(R0 I_b R0ᵀ, m 1), nodes m 1,
-/// with Ψ the elastic potential of the cloths (dynamics/cloth_elasticity.hpp).
+/// with Ψ the elastic potential of the cloths (dynamics/cloth_elasticity.hpp). The scheme of second order solves it for
+/// other targets, masses and strains (step/step.hpp).
 namespace diffsim {
 
 struct ZoneBody {
@@ -45,16 +46,29 @@ inline Vec6 inverse_mass_times(const ZoneBody& body, const Vec6& p) {
 struct ZoneNode {
     Vec3 start = Vec3::Zero();  ///< at the start of the step, zone frame
     double mass = 0.0;
+    double weight = 1.0;              ///< see ZoneBody::weight
     bool pinned = false;              ///< moves to its target whatever happens
     Vec3 target = Vec3::Zero();       ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
     Vec3 last_motion = Vec3::Zero();  ///< last step's motion: dt v0
+};
+
+/// How a step strains a cloth: the zone's energy has the term  scale Ψ(x0 + base_share (x1 - x0) + share y),  x0 where
+/// the nodes start the step and x1 where they were at the end of a first stage, if the time scheme has one.
+struct Straining {
+    double scale = 0.0;             ///< [s²]
+    double share = 1.0;             ///< [1]
+    double base_share = 0.0;        ///< [1]
+    std::vector<Vec3> first_stage;  ///< x1, zone frame; empty where there is none
+    double time = 0.0;              ///< over which strains change from those of `start`, for damping [s]
+    double start_share = 0.0;       ///< of the strains at x1 in `start`, the rest being those at x0 [1]
+    ElasticStart start;             ///< strains that damping is measured from
 };
 
 /// A cloth; all its nodes are in the zone.
 struct ZoneCloth {
     int id = 0;          ///< index into Model::cloths
     int first_node = 0;  ///< index into Zone::nodes
-    ElasticStart start;  ///< strains that damping is measured from
+    Straining straining;
 };
 
 /// A body that other bodies cannot move, in the world frame.
@@ -77,7 +91,6 @@ struct Zone {
     bool exact_contact = false;  ///< contacts do not give way: Eq. 6 as written
     Vec3 origin = Vec3::Zero();  ///< of the zone frame, world
     double ground_height = 0.0;  ///< zone frame
-    double dt = 0.0;             ///< [s]
     std::vector<ZoneBody> bodies;
     int dynamic_count = 0;
     std::vector<ZoneNode> nodes;
@@ -102,8 +115,7 @@ void list_feature_vertices(Zone& zone, const ZoneContact& contact);
 /// Make an empty zone in the memory of another one, for bodies and cloths of a model to join: the one way to make a
 /// zone. Compliance 0 asks for exact ones. Returns `zone`.
 Zone& make_zone(
-    Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, double dt,
-    const Vec3& origin);
+    Zone& zone, const Model& model, const std::vector<ClothParameters>& cloths, double compliance, const Vec3& origin);
 
 /// Pose of a body at its coordinates.
 Pose pose_at(const ZoneBody& body, const Vec6& y);

@@ -61,9 +61,14 @@ std::vector<Vec3> shaken(std::vector<Vec3> x, check::Random& random, double size
 }
 
 void add_zone_cloth(
-    Zone& zone, int id, const std::vector<Vec3>& start, const ClothParameters& parameters, const Vec3& target) {
+    Zone& zone, int id, const std::vector<Vec3>& start, const ClothParameters& parameters, double dt,
+    const Vec3& target) {
     const Cloth& cloth = zone.model->cloths[static_cast<std::size_t>(id)];
-    zone.cloths.push_back({id, zone.node_count(), elastic_start(cloth, start.data())});
+    zone.cloths.push_back({id, zone.node_count(), {}});
+    Straining& straining = zone.cloths.back().straining;
+    straining.scale = dt * dt;
+    straining.time = dt;
+    straining.start = elastic_start(cloth, start.data());
     for (std::size_t k = 0; k < start.size(); ++k) {
         ZoneNode node;
         node.start = start[k];

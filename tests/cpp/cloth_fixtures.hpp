@@ -33,9 +33,9 @@ std::vector<Vec3> rolled(const std::vector<Vec3>& sheet, double radius, double p
 std::vector<Vec3> moved(std::vector<Vec3> x, const Mat3& R, const Vec3& shift);
 std::vector<Vec3> shaken(std::vector<Vec3> x, check::Random& random, double size);
 
-/// Append a cloth of zone.model, its nodes going from `start` to start + target.
+/// Append a cloth of zone.model, its nodes going from `start` to start + target in a step of dt.
 void add_zone_cloth(
-    Zone& zone, int id, const std::vector<Vec3>& start, const ClothParameters& parameters,
+    Zone& zone, int id, const std::vector<Vec3>& start, const ClothParameters& parameters, double dt,
     const Vec3& target = Vec3::Zero());
 
 /// Bodies that do not yield, over boxes around the segments of their motions.

@@ -5,7 +5,7 @@ namespace fixtures::solve {
 Cubes::Cubes(bool on_ground) {
     model.thickness = kThickness;
     if (on_ground) model.ground = {true, 0.0, 0.5 * kThickness};
-    make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+    make_zone(zone, model, materials, kDefaultCompliance, Vec3::Zero());
 }
 
 void Cubes::add(const Vec3& position) {

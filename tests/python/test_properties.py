@@ -103,7 +103,7 @@ def _quiet() -> Any:
 # ---- scenes ----------------------------------------------------------------------------------------------------------
 
 
-@given(scenes(), st.sampled_from((0.001, DT, 0.05)), st.sampled_from(("implicit_euler", "trapezoidal")))
+@given(scenes(), st.sampled_from((0.001, DT, 0.05)), st.sampled_from(("implicit_euler", "second_order")))
 def test_every_scene_steps_with_finite_gradients_and_nothing_in_anything(
     scene: ds.Scene, dt: float, integrator: str
 ) -> None:

@@ -81,11 +81,11 @@ struct Scene {
     }
     Zone zone() const {
         Zone result;
-        make_zone(result, model, materials, compliance, kDt, Vec3::Zero());
+        make_zone(result, model, materials, compliance, Vec3::Zero());
         result.bodies = bodies;
         result.dynamic_count = static_cast<int>(bodies.size());
         for (int i = 0; i < model.cloth_count(); ++i) {
-            fixtures::add_zone_cloth(result, i, sheets[i].start, materials[i]);
+            fixtures::add_zone_cloth(result, i, sheets[i].start, materials[i], kDt);
             for (std::size_t k = 0; k < sheets[i].start.size(); ++k) {
                 ZoneNode& node = result.nodes[result.cloths.back().first_node + static_cast<int>(k)];
                 node.target = sheets[i].target[k];

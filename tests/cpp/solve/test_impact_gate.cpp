@@ -23,7 +23,7 @@ struct Pair {
         model.thickness = kThickness;
         const Vec3 half = Vec3::Constant(kHalf);
         for (int i = 0; i < 2; ++i) model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
-        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, Vec3::Zero());
         for (int i = 0; i < 2; ++i) {
             const Pose pose{Mat3::Identity(), Vec3(0.0, 0.0, 0.3 * i)};
             zone.bodies.push_back(fixtures::zone_body(i, pose, 1.0, fixtures::box_inertia(half, 1.0)));

@@ -33,7 +33,7 @@ struct Scene {
 
     Scene() {
         model.thickness = kThickness;
-        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, Vec3::Zero());
     }
     void add_box(const Pose& pose, const Vec6& target) {
         const Vec3 half = Vec3::Constant(kHalf);

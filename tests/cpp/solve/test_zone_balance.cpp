@@ -28,7 +28,7 @@ struct PulledBox {
         model.thickness = kThickness;
         model.ground = {true, 0.0, 0.5 * kThickness};
         model.bodies.push_back(fixtures::body(fixtures::box(half), 0.5 * kThickness));
-        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, Vec3::Zero());
         zone.friction = &friction;
         const Pose pose{Mat3::Identity(), Vec3(0.0, 0.0, half.z() + kThickness * (1.0 - 1e-5))};
         zone.bodies.push_back(fixtures::zone_body(0, pose, 1.0, fixtures::box_inertia(half, 1.0)));

@@ -299,8 +299,8 @@ Scene with_compliance(Scene scene, double compliance) {
     return scene;
 }
 
-Scene by_trapezoids(Scene scene) {
-    scene.options.integrator = Integrator::trapezoidal;
+Scene in_second_order(Scene scene) {
+    scene.options.integrator = Integrator::second_order;
     return scene;
 }
 
@@ -333,17 +333,26 @@ TEST(step_gradient_of_split_coupling) {
 TEST(step_gradient_of_split_coupling_with_soft_contacts) {
     check_step_gradient(with_compliance(with_split(caught_box()), 0.1), 1);
 }
-TEST(step_gradient_of_the_trapezoidal_scheme_tumbling) { check_step_gradient(by_trapezoids(tumbling()), 0); }
-TEST(step_gradient_of_the_trapezoidal_scheme_tilted_landing) {
-    check_step_gradient(by_trapezoids(tilted_landing()), 1);
+TEST(step_gradient_of_the_second_order_scheme_tumbling) { check_step_gradient(in_second_order(tumbling()), 0); }
+TEST(step_gradient_of_the_second_order_scheme_tilted_landing) {
+    check_step_gradient(in_second_order(tilted_landing()), 1);
 }
-TEST(step_gradient_of_the_trapezoidal_scheme_free_collision) {
-    check_step_gradient(by_trapezoids(free_collision()), 1);
+TEST(step_gradient_of_the_second_order_scheme_free_collision) {
+    check_step_gradient(in_second_order(free_collision()), 1);
 }
-TEST(step_gradient_of_the_trapezoidal_scheme_pushed_ball) { check_step_gradient(by_trapezoids(pushed_ball()), 2); }
-TEST(step_gradient_of_the_trapezoidal_scheme_caught_box) { check_step_gradient(by_trapezoids(caught_box()), 1); }
-TEST(step_gradient_of_the_trapezoidal_scheme_hard) {
-    check_step_gradient(by_trapezoids(with_compliance(caught_box(), 0.0)), 1, 10.0 * kDifferences);
+TEST(step_gradient_of_the_second_order_scheme_pushed_ball) { check_step_gradient(in_second_order(pushed_ball()), 2); }
+TEST(step_gradient_of_the_second_order_scheme_caught_box) { check_step_gradient(in_second_order(caught_box()), 1); }
+TEST(step_gradient_of_the_second_order_scheme_hanging_sheet) {
+    check_step_gradient(in_second_order(hanging_sheet()), 0);
+}
+TEST(step_gradient_of_the_second_order_scheme_landing_sheet) {
+    check_step_gradient(in_second_order(landing_sheet()), 3);
+}
+TEST(step_gradient_of_the_second_order_scheme_meeting_sheets) {
+    check_step_gradient(in_second_order(meeting_sheets()), 3);
+}
+TEST(step_gradient_of_the_second_order_scheme_hard) {
+    check_step_gradient(in_second_order(with_compliance(caught_box(), 0.0)), 1, 10.0 * kDifferences);
 }
 
 }  // namespace test_step_gradient

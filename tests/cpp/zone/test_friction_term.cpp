@@ -31,7 +31,7 @@ struct Boxes {
         const Vec3 half(0.4, 0.3, 0.2);
         model.bodies.push_back(fixtures::body(fixtures::box(half), 0.3 * kThickness));
         model.bodies.push_back(fixtures::body(fixtures::box(half), 0.7 * kThickness));
-        make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+        make_zone(zone, model, materials, kDefaultCompliance, Vec3::Zero());
         zone.friction = &friction;
         const Mat3 on_edge = exp_rotation(Vec3(0.0, 0.8, 0.0));
         const Mat3 upper =

@@ -73,7 +73,7 @@ void add_all_contacts(Zone& zone) {
 Zone random_zone(const Model& model, check::Random& random, Coordinates& y) {
     static const std::vector<ClothParameters> no_cloth;
     Zone zone;
-    make_zone(zone, model, no_cloth, kDefaultCompliance, 0.01, Vec3::Zero());
+    make_zone(zone, model, no_cloth, kDefaultCompliance, Vec3::Zero());
     zone.dynamic_count = 3;
     y = Coordinates();
     const Vec3 places[5] = {{-0.8, 0, -0.4}, {0.8, 0.1, -0.3}, {0, 0, 0.95}, {0, 1.35, 0}, {0, -1.2, 0}};

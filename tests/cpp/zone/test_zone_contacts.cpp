@@ -67,7 +67,7 @@ Vec6 random_motion(check::Random& random, double size) {
 Case random_case(const Room& room, check::Random& random, double motion) {
     Case c;
     Zone& zone = c.zone;
-    make_zone(zone, room.model, room.materials, kDefaultCompliance, 0.01, random_vec3(random));
+    make_zone(zone, room.model, room.materials, kDefaultCompliance, random_vec3(random));
     const auto pose = [&] { return Pose{random_rotation(random), random_vec3(random, 0.7) - zone.origin}; };
     for (int i = 0; i < 2; ++i) {
         zone.bodies.push_back(fixtures::zone_body(i, pose(), 1.0, 0.1 * Mat3::Identity()));
@@ -83,7 +83,7 @@ Case random_case(const Room& room, check::Random& random, double motion) {
         const Pose place = pose();
         const std::vector<Vec3> roll =
             fixtures::shaken(i == 0 ? fixtures::rolled(cloth.rest, 0.15, 0.08) : cloth.rest, random, 0.02);
-        fixtures::add_zone_cloth(zone, i, fixtures::moved(roll, place.R, place.t), room.materials[i]);
+        fixtures::add_zone_cloth(zone, i, fixtures::moved(roll, place.R, place.t), room.materials[i], 0.01);
         const Vec3 common = random_vec3(random, 2.0 * motion);
         for (int k = 0; k < cloth.node_count(); ++k) {
             c.begin.nodes.push_back(random_vec3(random, 0.3 * motion));
@@ -362,7 +362,7 @@ TEST(contacts_with_a_driven_body_are_listed_for_all_its_way) {
         model.bodies.push_back(fixtures::body(fixtures::box(Vec3(0.3, 0.2, 0.1)), 0.5 * kThickness, kind));
     std::vector<ClothParameters> materials;
     Zone zone;
-    make_zone(zone, model, materials, kDefaultCompliance, 0.01, Vec3::Zero());
+    make_zone(zone, model, materials, kDefaultCompliance, Vec3::Zero());
     zone.bodies.push_back(fixtures::zone_body(0, Pose(), 1.0, Mat3::Identity()));
     zone.dynamic_count = 1;
     const Vec6 target = -0.4 * Vec6::Unit(3);  // and so ends half the thickness from the other
