@@ -53,6 +53,8 @@ class Info:
     failure: str  #: why the first of them did not; "" if all converged
     #: the failed steps, by step, then scene; the first 256, if `failed_steps` is more than that
     failures: list[Failure]
+    #: steps of the call that were not found at once and were taken in 2 to 8 shorter ones
+    refined_steps: int
     #: in all steps of the call, pairs of bodies that met while moving about as far in a step as the smaller is large
     #: (1.5 times its radius): such bodies can come around each other within a few steps
     fast_impacts: int
@@ -175,6 +177,7 @@ def combined(segments: list[Any], names: Sequence[str]) -> Info:
         converged=all(segment.converged for segment in segments),
         scenes_converged=torch.from_numpy(np.asarray(scenes_converged)),
         failed_steps=sum(segment.failed_steps for segment in segments),
+        refined_steps=sum(segment.refined_steps for segment in segments),
         fast_impacts=sum(segment.fast_impacts for segment in segments),
         failure=failures[0].reason if failures else "",
         failures=failures[:_MAX_FAILURES],

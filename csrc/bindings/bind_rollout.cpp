@@ -235,6 +235,7 @@ void bind_rollout(py::module_& module) {
     py::class_<RolloutInfo>(module, "Info", "Statistics of a rollout; counts are those of its last step.")
         .def_readonly("converged", &RolloutInfo::converged)
         .def_readonly("failed_steps", &RolloutInfo::failed_steps)
+        .def_readonly("refined_steps", &RolloutInfo::refined_steps)
         .def_readonly("fast_impacts", &RolloutInfo::fast_impacts)
         .def_property_readonly("failure", [](const RolloutInfo& info) { return failure_text(info.status); })
         .def_property_readonly("failures", &failures)

@@ -90,7 +90,9 @@ struct Options {
     /// [qiao2020scalable]; none: it converges.
     std::optional<int> newton_iterations;
     Integrator integrator = Integrator::implicit_euler;
-    StepPart part = StepPart::whole;  ///< set by the step itself
+    // Set by the step itself:
+    StepPart part = StepPart::whole;
+    bool is_last_resort = false;  ///< it was searched for in shorter steps, too: no effort is too much
 };
 
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.

@@ -47,6 +47,7 @@ RolloutInfo merged(const std::vector<RolloutInfo>& scenes) {
     RolloutInfo total;
     for (const RolloutInfo& info : scenes) {
         total.failed_steps += info.failed_steps;
+        total.refined_steps += info.refined_steps;
         total.fast_impacts += info.fast_impacts;
         total.failures.insert(total.failures.end(), info.failures.begin(), info.failures.end());
         total.scenes_converged.push_back(info.failed_steps == 0);
@@ -119,6 +120,7 @@ RolloutInfo rollout(
                 state = hold(state, StepStatus::bad_start, std::move(pair), info.last, record);
             }
             info.fast_impacts += info.last.fast_impacts;
+            info.refined_steps += info.last.substeps > 1;
             if (!info.last.converged) note_failure(info.last, scene, shape.first_step + time, info);
             signatures
                 [static_cast<std::size_t>(time) * static_cast<std::size_t>(shape.batch) +

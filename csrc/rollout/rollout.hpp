@@ -66,6 +66,7 @@ inline constexpr std::size_t kMaxFailures = 256;
 struct RolloutInfo {
     bool converged = true;
     int failed_steps = 0;
+    int refined_steps = 0;                      ///< that were taken in shorter ones
     int fast_impacts = 0;                       ///< of all steps
     StepStatus status = StepStatus::converged;  ///< of the first of `failures`
     std::vector<FailedStep> failures;           ///< the first kMaxFailures, by step, then scene

@@ -66,9 +66,9 @@ void add_upstream(
 SceneState end_state(const StepRecord& record) {
     SceneState end = record.start;
     if (record.held) return end;
-    for (std::size_t i = 0; i < end.bodies.size(); ++i) {
-        end.bodies[i].orientation = turned(end.bodies[i].orientation, record.y.bodies[i].head<3>());
-    }
+    for (const StepRecord* part = &record; part != nullptr; part = part->next.get())
+        for (std::size_t i = 0; i < end.bodies.size(); ++i)
+            end.bodies[i].orientation = turned(end.bodies[i].orientation, part->y.bodies[i].head<3>());
     return end;
 }
 
@@ -359,11 +359,11 @@ namespace {
 template <class Visit>
 auto with_last_step(const Tape& tape, const RolloutInputs& inputs, int scene, const Visit& visit) {
     const Model& model = *tape.model;
-    const StepRecord& record = tape.records[scene].back();
+    Options options = tape.options;
+    const StepRecord& record = last_part(tape.records[scene].back(), options);
     Workers workers(1);
     SceneControl control;
     read_control(model, inputs, tape.shape.steps - 1, scene, record.start, workers, control);
-    Options options = tape.options;
     if (record.velocities) options.part = StepPart::velocities;
     const StepRecord& part = record.velocities ? *record.velocities : record;
     return visit(model, options, read_parameters(model, inputs, scene), control, part);

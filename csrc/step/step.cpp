@@ -450,7 +450,8 @@ std::size_t StepRecord::bytes() const {
            (start.node_position.capacity() + start.node_velocity.capacity() + y.nodes.capacity() +
             elastic_shift.capacity() + first_stage.capacity()) *
                sizeof(Vec3) +
-           zones.bytes() + (velocities ? velocities->bytes() : 0) + (stage ? stage->bytes() : 0);
+           zones.bytes() + (velocities ? velocities->bytes() : 0) + (stage ? stage->bytes() : 0) +
+           (next ? next->bytes() : 0);
 }
 
 SceneState solve_part(

@@ -41,8 +41,11 @@ struct StepRecord {
     TouchingZones zones;
     std::vector<Vec3>
         first_stage;  ///< per node: where it was at the end of the first stage; empty where there was none
-    // Of a step that has several parts; this one is of the places then.
+    // Of a time scheme that has several parts; this one is of the places then.
     std::unique_ptr<StepRecord> velocities, stage;
+    // Of a step that was taken in shorter ones: how often dt was halved for this one, and the one after it.
+    int halvings = 0;
+    std::unique_ptr<StepRecord> next;
 
     std::size_t bytes() const;
 };
@@ -59,6 +62,7 @@ struct StepInfo {
     double max_compression = 0.0;  ///< of a contact below its rest distance [m]
     int fast_impacts = 0;          ///< pairs of bodies with a fast ImpactGate
     double seconds_motion = 0.0, seconds_broad_phase = 0.0, seconds_zones = 0.0;
+    int substeps = 1;                 ///< that the step was taken in, which it is where it is not found at once
     std::uint64_t signature = 0;      ///< hash of the active contacts and their types
     std::vector<int> failed_objects;  ///< bodies and cloths of what did not converge, ascending
 
@@ -121,9 +125,9 @@ public:
 /// From how many bodies on loops that do little for each are shared among threads, and in what portions.
 inline constexpr int kBodiesARange = 128;
 
-/// Advance by options.dt. `record`, if given, receives what step_backward needs; it does not change the result.
-/// Throws PenetratingStart if objects penetrate at the start. Where motions are too large for
-/// numbers to hold, all is held.
+/// Advance by options.dt, in shorter steps where one is not found. `record`, if given, receives what step_backward
+/// needs; it does not change the result. Throws PenetratingStart if objects penetrate at the start. Where motions are too
+/// large for numbers to hold, all is held.
 SceneState step(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record);
@@ -139,6 +143,9 @@ void step_backward(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient);
+
+/// Of a step, the record and the options of the last of the shorter ones it was taken in, or its own.
+const StepRecord& last_part(const StepRecord& record, Options& options);
 
 /// The linear systems of adjoint modes dense and qr, one per zone of a step.
 std::vector<LinearisedZone> linearised_zones(

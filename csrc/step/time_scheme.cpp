@@ -1,3 +1,5 @@
+#include "step/time_scheme.hpp"
+
 #include <algorithm>
 #include <iterator>
 #include <memory>
@@ -5,7 +7,6 @@
 
 #include "dynamics/two_stages.hpp"
 #include "step/group_step.hpp"
-#include "step/step.hpp"
 #include "step/step_part.hpp"
 
 namespace diffsim {
@@ -19,11 +20,8 @@ bool in_parts(const Model& model, const Options& options) {
 }
 
 Options for_part(const Options& options, StepPart part) {
-    Options result = options;
+    Options result = part == StepPart::first_stage ? over_part(options, kStage) : options;
     result.part = part;
-    if (part != StepPart::first_stage) return result;
-    result.dt = kStage * options.dt;
-    result.compliance = options.compliance / (kStage * kStage);  // its unit has the step in it
     return result;
 }
 
@@ -89,7 +87,14 @@ void add_to(SceneStateGradient& sum, const SceneStateGradient& part) {
 
 }  // namespace
 
-SceneState step(
+Options over_part(const Options& options, double part) {
+    Options result = options;
+    result.dt *= part;
+    result.compliance /= part * part;
+    return result;
+}
+
+SceneState step_at_once(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record) {
     std::vector<Vec3> first_stage;
@@ -127,7 +132,7 @@ SceneState step(
     return result;
 }
 
-void step_backward(
+void backward_at_once(
     const Model& model, const Options& options, const Parameters& parameters, const SceneControl& control,
     const StepRecord& record, const GradientNeeds& needs, StepWorkspace& workspace, SceneStateGradient& gradient,
     SceneControlGradient& control_gradient, ParameterGradient& parameter_gradient) {
