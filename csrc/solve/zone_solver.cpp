@@ -116,7 +116,8 @@ private:
         m_work.y_end = y();
         for (int i = 0; i < m_zone.dynamic_count; ++i) m_work.y_end.bodies[i] = m_zone.bodies[i].last_motion;
         for (int i = 0; i < m_zone.node_count(); ++i)
-            if (!m_zone.nodes[i].pinned) m_work.y_end.nodes[i] = m_zone.nodes[i].last_motion;
+            if (!m_zone.nodes[i].pinned)
+                m_work.y_end.nodes[i] = m_zone.nodes[i].guess.value_or(m_zone.nodes[i].last_motion);
         if (largest_move() < kEpsilon * m_path.position()) return;
         m_path.ensure_covered(m_work.y_end);
         // Impacts on the way stop it short of the contacts. Near their poles it would start with more energy than y = 0

@@ -79,7 +79,7 @@ void add_cloth(Zone& zone, int id, const StepSetting& setting, const SceneState&
             if (setting.part == StepPart::places && two_stages) {
                 node.target = place_by_velocity(setting, i, state, node.target);
                 if (setting.end_velocity != nullptr && !setting.end_velocity->empty())
-                    node.last_motion = place_by_velocity(setting, i, state, dt * (*setting.end_velocity)[i]);
+                    node.guess = place_by_velocity(setting, i, state, dt * (*setting.end_velocity)[i]);
             }
         }
         zone.nodes.push_back(node);

@@ -126,8 +126,8 @@ public:
 inline constexpr int kBodiesARange = 128;
 
 /// Advance by options.dt, in shorter steps where one is not found. `record`, if given, receives what step_backward
-/// needs; it does not change the result. Throws PenetratingStart if objects penetrate at the start. Where motions are too
-/// large for numbers to hold, all is held.
+/// needs; it does not change the result. Throws PenetratingStart if objects penetrate at the start. Where motions are
+/// too large for numbers to hold, all is held.
 SceneState step(
     const Model& model, const Options& options, const Parameters& parameters, const SceneState& state,
     const SceneControl& control, StepWorkspace& workspace, StepInfo& info, StepRecord* record);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <optional>
 #include <vector>
 
 #include "contact/contact_derivatives.hpp"
@@ -50,6 +51,7 @@ struct ZoneNode {
     bool pinned = false;              ///< moves to its target whatever happens
     Vec3 target = Vec3::Zero();       ///< ŷ: dt v̂ of a free node, dt times its given velocity of a pinned one
     Vec3 last_motion = Vec3::Zero();  ///< last step's motion: dt v0
+    std::optional<Vec3> guess;        ///< where the search may begin, if anything better is known than last_motion
 };
 
 /// How a step strains a cloth: the zone's energy has the term  scale Ψ(x0 + base_share (x1 - x0) + share y),  x0 where
