@@ -202,7 +202,8 @@ _WRINKLES = (
 )
 _DAMPED = (
     " What is damped 40 times as much does not wrinkle, and the limit is sharp to 2 %: what it changes by from dt ="
-    " 0.0006 to 0.0003 s."
+    " 0.0006 to 0.0003 s. At dt = 0.00125 s differences of `second_order` step over a kink: those a tenth as wide agree"
+    " with the adjoint to 1e-8."
 )
 
 CONTACT_GRADIENTS = (

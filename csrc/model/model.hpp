@@ -92,7 +92,7 @@ struct Options {
     Integrator integrator = Integrator::implicit_euler;
     // Set by the step itself:
     StepPart part = StepPart::whole;
-    bool is_last_resort = false;  ///< it was searched for in shorter steps, too: no effort is too much
+    bool is_substep = false;  ///< of a step that was not found at once: what is not found soon is halved again
 };
 
 /// Physical parameters of one scene. Entries of static and kinematic bodies are not used.

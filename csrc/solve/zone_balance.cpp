@@ -15,7 +15,8 @@ constexpr int kMaxDamped = 4;    // models in a row: what friction takes up is k
 constexpr double kRest = 1e-12;  // of the forces: a model that moves nothing further has found the balance
 constexpr double kNearlyRests = 1e-6;   // of the forces: slips up to which it may be held by forces found beforehand
 constexpr int kMaxFactors = 10000;      // of all models of a step
-constexpr int kMaxAtOnce = 300;         // of them before the balance is searched in parts
+constexpr int kMaxAtFirst = 300;        // of them before the balance is searched in rounds
+constexpr int kMaxAtOnce = 2500;        // and where that does not find it either
 constexpr int kMaxStops = 60;           // of bounds that stand still
 constexpr double kRoundAccuracy = 0.1;  // of what is left of the balance at its begin: to which a round is followed
 constexpr int kMaxDescent = 20;         // models of a round
@@ -35,11 +36,17 @@ public:
         m_search.m_result.iterations = 0;
         if (m_search.drives_done() && rests()) return;
         const int most = m_search.m_options.max_iterations;
-        StepStatus status = search(most, kMaxAtOnce);
+        StepStatus status = search(most, kMaxAtFirst);
         if (status == StepStatus::blocked) return m_search.fail(status);
+        const Start there = {m_work.point.y, {}, m_model.memory()};
+        const bool patient = !m_search.m_options.is_substep;
+        if (patient && status != StepStatus::converged && m_least < kInfinity) status = search_in_rounds(status);
+        if (patient && status != StepStatus::converged && m_least < kInfinity) {
+            go_to(there.y);
+            m_model.recall(there.contacts);
+            status = search(most, kMaxAtOnce);
+        }
         if (status != StepStatus::converged && m_least < kInfinity && !is_driven()) status = search_in_parts(status);
-        if (status != StepStatus::converged && m_least < kInfinity && m_search.m_options.is_last_resort)
-            status = search_in_rounds(status);
         if (status != StepStatus::converged) fail(status);
     }
 
@@ -171,7 +178,6 @@ private:
             begin = {m_work.point.y, {}, m_model.memory()};
         }
         m_held = {};
-        m_in_parts = false;
         return status;
     }
 

@@ -30,7 +30,7 @@ struct ZoneOptions {
     /// whose pinned nodes are at their targets from the first. Once from rest is Eq. 3 of [Qiao et al. 2020].
     std::optional<int> full_steps;
     Interrupt* interrupt = nullptr;  ///< may be asked between iterations: whoever waits for a long zone may have gone
-    bool is_last_resort = false;     ///< see Options
+    bool is_substep = false;         ///< see Options
 };
 
 struct ZoneResult {

@@ -95,7 +95,7 @@ ZoneResult GroupStep::solve_elastic(int cloth, ZoneMemory& memory) const {
 }
 
 ZoneOptions GroupStep::zone_options() const {
-    return {m_options.tolerance, m_options.max_iterations, std::nullopt, m_interrupt, m_options.is_last_resort};
+    return {m_options.tolerance, m_options.max_iterations, std::nullopt, m_interrupt, m_options.is_substep};
 }
 
 /// The memory's zone, empty.

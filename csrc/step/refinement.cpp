@@ -8,15 +8,17 @@
 
 /// A step whose solution is not found is taken in two halves, and these in theirs: over a shorter time things move
 /// less, and contacts turn less from where models of them are true. What is found so is a step like any other, and has
-/// its gradient. What is not, as where something jams, is searched for once more in one, with more patience.
+/// its gradient.
 namespace diffsim {
 namespace {
 
 constexpr int kMaxHalvings = 3;
 constexpr int kMaxFailures = 4;  // searches of a step that found nothing
 
-/// Where a search was given up. What is blocked or overflows is so in shorter steps, too.
+/// Where a search was given up. What is blocked or overflows is so in shorter steps, too, and bodies that meet fast may
+/// come around each other from one to the next.
 bool is_given_up(const StepInfo& info) {
+    if (info.fast_impacts > 0) return false;
     switch (info.status) {
         case StepStatus::crawls:
         case StepStatus::no_descent:
@@ -65,7 +67,10 @@ public:
         std::vector<std::unique_ptr<StepRecord>> records;
         SceneState refined = state;
         const bool found = in_halves(refined, 1, parts, record != nullptr ? &records : nullptr);
-        if (!found) return m_parameters.friction.empty() ? end : try_harder(state, parts, info, record);
+        if (!found) {
+            add_trial(parts, info);
+            return end;
+        }
         info = parts;
         if (record != nullptr) {
             for (std::size_t k = records.size() - 1; k > 0; --k) records[k - 1]->next = std::move(records[k]);
@@ -76,17 +81,10 @@ public:
 
 private:
     SceneState attempt(const SceneState& state, int halvings, StepInfo& info, StepRecord* record) {
-        SceneState end = step_at_once(
-            m_model, halved(m_options, halvings), m_parameters, state, m_control, m_workspace, info, record);
-        if (!info.converged) ++m_failures;
-        return end;
-    }
-
-    SceneState try_harder(const SceneState& state, const StepInfo& trials, StepInfo& info, StepRecord* record) {
-        Options options = m_options;
-        options.is_last_resort = true;
+        Options options = halved(m_options, halvings);
+        options.is_substep = halvings > 0;
         SceneState end = step_at_once(m_model, options, m_parameters, state, m_control, m_workspace, info, record);
-        add_trial(trials, info);
+        if (!info.converged) ++m_failures;
         return end;
     }
 

@@ -19,7 +19,7 @@ from _report_free import FREE  # noqa: E402
 from _report_friction import FRICTION, PEERS, bowled, top_axis  # noqa: E402
 from _report_gradients import CONTACT_GRADIENTS, Inputs, relative  # noqa: E402
 from _report_impacts import two_balls  # noqa: E402
-from _report_motion import TRAPEZOIDAL, ValueScene, mujoco_bodies  # noqa: E402
+from _report_motion import SECOND_ORDER, ValueScene, mujoco_bodies  # noqa: E402
 from _report_page import Panel, verdict  # noqa: E402
 from work_precision import SCENES, Report, section_of_values  # noqa: E402
 
@@ -43,7 +43,7 @@ def test_with_friction_our_second_order_steps_go_to_the_closed_forms(name: str) 
     case = scene_of(FRICTION, name)
     errors = []
     for dt in (0.01, 0.0025):
-        motion = TRAPEZOIDAL.prepare(case.build(), dt, case.duration).motion()
+        motion = SECOND_ORDER.prepare(case.build(), dt, case.duration).motion()
         assert float((motion.states.position[-1] - motion.start.position).norm()) > 0.1
         errors.append([error(motion, None) for error in case.errors.values()])
     assert max(errors[1]) < 2e-5
