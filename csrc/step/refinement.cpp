@@ -83,7 +83,13 @@ private:
     SceneState attempt(const SceneState& state, int halvings, StepInfo& info, StepRecord* record) {
         Options options = halved(m_options, halvings);
         options.is_substep = halvings > 0;
-        SceneState end = step_at_once(m_model, options, m_parameters, state, m_control, m_workspace, info, record);
+        SceneState end;
+        try {
+            end = step_at_once(m_model, options, m_parameters, state, m_control, m_workspace, info, record);
+        } catch (const PenetratingStart& start) {
+            if (halvings == 0) throw;  // the caller's state; else one of ours
+            end = hold(state, StepStatus::bad_start, {start.a}, info, record);
+        }
         if (!info.converged) ++m_failures;
         return end;
     }

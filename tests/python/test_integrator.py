@@ -301,6 +301,23 @@ def test_gradients_of_40_steps_against_central_differences(name: str) -> None:
     assert max(d.error for d in report.stable) <= 1e-4, report
 
 
+def test_the_gradient_of_a_material_alone_is_that_beside_the_states() -> None:
+    found = []
+    for with_state in (False, True):
+        sim = simulator(swinging_sheet(0.02))
+        start = sim.initial_state()
+        start.node_position.requires_grad_(with_state)
+        leaves = [sim.cloth_stretch.requires_grad_(), sim.cloth_damping.requires_grad_()] + [
+            start.node_position
+        ] * with_state
+        end = sim.rollout(start, None, 3)[-1]
+        loss = (end.node_position * torch.arange(147.0).reshape(49, 3).cos()).sum()
+        found.append(torch.autograd.grad(loss, leaves)[:2])
+    for alone, beside in zip(*found):
+        assert float(alone.norm()) > 1e-12
+        assert torch.equal(alone, beside)
+
+
 @pytest.mark.parametrize("adjoint", ["qr", "dense"])
 def test_the_papers_adjoints_are_the_exact_one_where_contact_has_no_curvature(adjoint: str) -> None:
     found = []

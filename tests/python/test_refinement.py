@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -63,6 +64,7 @@ def test_it_is_two_steps_of_half_the_time() -> None:
     torch.testing.assert_close(contacts.force, expected.force, rtol=0.0, atol=0.0)
 
 
+@pytest.mark.filterwarnings("ignore::diffsim.ConvergenceWarning")  # of steps before
 def test_its_gradient_is_that_of_the_shorter_steps() -> None:
     """A landing, which takes one iteration more than it may have: where cards slide, all depends on rounding."""
     sim = ds.Simulator(scenes.tilted_box(), DT, max_iterations=4)
@@ -91,6 +93,29 @@ def test_its_gradient_is_that_of_the_shorter_steps() -> None:
         expected = (ends[0] - ends[1]) / (2.0 * EPS)
         assert abs(expected) > 1e-5
         assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-8)
+
+
+def test_forces_of_its_end_have_gradients() -> None:
+    sim = ds.Simulator(scenes.tilted_box(), DT, max_iterations=4, on_failure="warn")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ds.ConvergenceWarning)
+        state = before_a_refined_step(sim)
+
+    def push(velocity: torch.Tensor) -> torch.Tensor:
+        contacts = sim.contacts(state.replace(velocity=velocity))
+        assert sim.info is not None
+        assert sim.info.refined_steps == 1
+        return contacts.net_force()[0, 2]
+
+    velocity = state.velocity.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(push(velocity), velocity)
+    along = torch.tensor([[0.2, -0.3, 1.0]], dtype=torch.float64)
+    with torch.no_grad():
+        ends = [float(push(state.velocity + sign * 10.0 * EPS * along)) for sign in (1.0, -1.0)]
+    expected = (ends[0] - ends[1]) / (20.0 * EPS)
+    assert abs(expected) > 100.0
+    # Forces are known as well as places, times contacts' stiffness: 1e-5 N here.
+    assert float((gradient * along).sum()) == pytest.approx(expected, rel=3e-3)
 
 
 def test_its_bits_are_those_of_a_batch_and_of_checkpoints() -> None:
