@@ -307,9 +307,7 @@ def test_the_gradient_of_a_material_alone_is_that_beside_the_states() -> None:
         sim = simulator(swinging_sheet(0.02))
         start = sim.initial_state()
         start.node_position.requires_grad_(with_state)
-        leaves = [sim.cloth_stretch.requires_grad_(), sim.cloth_damping.requires_grad_()] + [
-            start.node_position
-        ] * with_state
+        materials = [sim.cloth_stretch.requires_grad_(), sim.cloth_damping.requires_grad_()]
         end = sim.rollout(start, None, 3)[-1]
         loss = (end.node_position * torch.arange(147.0).reshape(49, 3).cos()).sum()
         found.append(torch.autograd.grad(loss, materials))
