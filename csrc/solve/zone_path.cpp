@@ -20,6 +20,7 @@ ZonePath::ZonePath(
     BlockSystem& system)
     : m_zone(zone), m_passive(passive), m_point(point), m_trial(trial), m_coverage(coverage), m_system(system) {
     forget_contacts(zone);
+    m_coverage.strays.clear();
 }
 
 void ZonePath::set_to_targets(Coordinates& y_end) const {

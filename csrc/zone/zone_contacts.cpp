@@ -12,6 +12,8 @@ namespace {
 
 constexpr double kRoom = 0.05;     // of its thickness: room on all sides of a body at rest
 constexpr double kSidestep = 0.1;  // of a body's motion: room on all sides of it. More lists neighbours it never meets.
+constexpr double kStray = 0.5;  // of its motion: where a way of the body has left a list, which its next ones do, too
+constexpr double kOfFeature = 0.2;    // of the size of its features, at most: more lists them in numbers
 constexpr double kWholeMotion = 0.5;  // of a cloth's motion in the step: counts as motion yet to come
 
 SweptMesh swept_mesh(const Zone& zone, int body, const Vec6& begin, const Vec6& end, double slack) {
@@ -119,6 +121,20 @@ void add_contact(Zone& zone, const Contact& contact, ZoneObject a, ZoneObject b)
 
 namespace {
 
+/// How far a vertex of a body at most is from where it is listed for.
+double deviation(const Zone& zone, const ContactCoverage& coverage, const Coordinates& y, int body) {
+    const std::size_t i = static_cast<std::size_t>(body);
+    const Vec6 segment = coverage.end.bodies[i] - coverage.begin.bodies[i];
+    const Vec6 offset = y.bodies[i] - coverage.begin.bodies[i];
+    const double radius = zone.mesh(body).radius;
+    // Nearest point of the segment, with turns weighed by the radius.
+    Vec6 weighed = segment;
+    weighed.head<3>() *= radius * radius;
+    const double length_sq = weighed.dot(segment);
+    const double s = length_sq > 0.0 ? std::clamp(weighed.dot(offset) / length_sq, 0.0, 1.0) : 0.0;
+    return motion_bound(offset - s * segment, radius);
+}
+
 /// Collects the contacts of a zone; its steps as members.
 class ContactLister {
 public:
@@ -136,6 +152,7 @@ public:
           m_features(coverage.scratch.features) {}
 
     void run() {
+        mark_strays();
         m_zone.contacts.clear();
         m_coverage.slack.clear();
         m_coverage.cloth_slack.clear();
@@ -180,6 +197,28 @@ private:
     }
     bool yields(int i) const { return i < m_zone.dynamic_count || i >= m_zone.body_count(); }
 
+    void mark_strays() {
+        const std::size_t count = static_cast<std::size_t>(m_zone.dynamic_count);
+        std::vector<char>& strays = m_coverage.strays;
+        if (strays.empty()) {
+            strays.assign(count, 0);
+            return;
+        }
+        for (std::size_t i = 0; i < count; ++i)
+            strays[i] = strays[i] || deviation(m_zone, m_coverage, m_end, static_cast<int>(i)) > m_coverage.slack[i];
+    }
+
+    /// Room on all sides of the way of a body that yields.
+    double room(int i, double motion) const {
+        const CollisionMesh& mesh = m_zone.mesh(i);
+        double sidestep = kSidestep * motion;
+        if (m_coverage.strays[static_cast<std::size_t>(i)]) {
+            const double feature = mesh.radius / std::sqrt(static_cast<double>(mesh.patches.size()));
+            sidestep = std::max(sidestep, std::min(kStray * motion, kOfFeature * feature));
+        }
+        return kRoom * m_zone.model->own_thickness(id(i)) + sidestep;
+    }
+
     void add_body(int i) {
         const double radius = m_zone.mesh(i).radius;
         const bool yields = i < m_zone.dynamic_count;
@@ -188,7 +227,7 @@ private:
         const Vec6 change = end - m_begin.bodies[i];
         // Late ways are short, but they may turn: room in proportion to the step's whole motion, too.
         const double motion = std::max(motion_bound(change, radius), motion_bound(end, radius));
-        const double slack = yields ? kRoom * m_zone.model->own_thickness(id(i)) + kSidestep * motion : 0.0;
+        const double slack = yields ? room(i, motion) : 0.0;
         if (yields) m_coverage.slack.push_back(slack);
         m_meshes.push_back(swept_mesh(m_zone, i, m_begin.bodies[i], end, slack + sagitta(change, radius)));
         m_boxes.push_back(swept_box(m_meshes.back()));
@@ -290,18 +329,8 @@ void collect_contacts(
 }
 
 bool is_covered(const Zone& zone, const ContactCoverage& coverage, const Coordinates& y) {
-    for (int i = 0; i < zone.dynamic_count; ++i) {
-        const Vec6 segment = coverage.end.bodies[i] - coverage.begin.bodies[i];
-        const Vec6 offset = y.bodies[i] - coverage.begin.bodies[i];
-        const double radius = zone.mesh(i).radius;
-        // Nearest point of the segment, with turns weighed by the radius.
-        Vec6 weighed = segment;
-        weighed.head<3>() *= radius * radius;
-        const double length_sq = weighed.dot(segment);
-        const double s = length_sq > 0.0 ? std::clamp(weighed.dot(offset) / length_sq, 0.0, 1.0) : 0.0;
-        const Vec6 deviation = offset - s * segment;
-        if (motion_bound(deviation, radius) > coverage.slack[i]) return false;
-    }
+    for (int i = 0; i < zone.dynamic_count; ++i)
+        if (deviation(zone, coverage, y, i) > coverage.slack[static_cast<std::size_t>(i)]) return false;
     for (int c = 0; c < static_cast<int>(zone.cloths.size()); ++c)
         if (!is_cloth_covered(zone, coverage, c, y)) return false;
     return true;

@@ -11,6 +11,7 @@ struct ContactCoverage {
     Coordinates begin, end;
     std::vector<double> slack;        ///< one per dynamic body [m]
     std::vector<double> cloth_slack;  ///< one per cloth, for each of its nodes [m]
+    std::vector<char> strays;         ///< dynamic bodies whose ways have left a list; empty before the first list
 
     /// Memory that listing reuses.
     struct Scratch {

@@ -220,6 +220,30 @@ TEST(coordinates_off_the_segment_are_not_covered) {
     }
 }
 
+TEST(a_body_whose_way_has_left_a_list_gets_more_room_in_the_next_one) {
+    const Room room;
+    check::Random random(4);
+    for (int k = 0; k < 20; ++k) {
+        NOTE(k);
+        Case c = random_case(room, random, 0.02);
+        const std::size_t stray = static_cast<std::size_t>(k % 2);
+        c.end.bodies[stray].tail<3>() += 2.0 * c.coverage.slack[stray] * Vec3::UnitZ() +
+                                         2.0 * (c.end.bodies[stray] - c.begin.bodies[stray]).tail<3>();
+        CHECK(!is_covered(c.zone, c.coverage, c.end));
+        ContactCoverage first;
+        collect_contacts(c.zone, c.passive, c.begin, c.end, first);
+        collect_contacts(c.zone, c.passive, c.begin, c.end, c.coverage);
+        CHECK(c.coverage.slack[1 - stray] == first.slack[1 - stray]);
+        CHECK(c.coverage.slack[stray] > first.slack[stray]);
+        const CollisionMesh& mesh = c.zone.mesh(static_cast<int>(stray));
+        CHECK(c.coverage.slack[stray] < first.slack[stray] + mesh.radius / 3.0);
+        // It keeps that in all lists of the step.
+        const double slack = c.coverage.slack[stray];
+        collect_contacts(c.zone, c.passive, c.begin, c.end, c.coverage);
+        CHECK(c.coverage.slack[stray] == slack);
+    }
+}
+
 TEST(contacts_name_their_objects_and_blocks) {
     const Room room;
     check::Random random(3);
