@@ -6,21 +6,22 @@
 namespace diffsim {
 namespace {
 
-constexpr int kMaxNewtonSteps = 100;     // a guard against rounding's whims: one model in 2,000 of a dense bin meets it
+constexpr int kMaxNewtonSteps = 100;  // a guard against rounding's whims: none has been seen to need half of them
+constexpr int kFullSteps = 8;
 constexpr double kLineTolerance = 1e-4;  // of the step: Newton corrects the rest
 constexpr double kSideTolerance = 1e-9;  // of the contact's range: nearer than this a row is on neither side
 
 /// Minimise the convex piecewise quadratic t -> m(p + t s) for t > 0: Newton with bisection as its guard.
 double exact_line_search(
     const std::vector<double>& violation, const std::vector<double>& slope, const std::vector<ContactRow>& rows,
-    double first, double second) {
+    double share, double first, double second) {
     double lower = 0.0, upper = kInfinity, t = 1.0;
     for (int k = 0; k < 60; ++k) {
         double derivative = first + t * second, curvature = second;
         for (std::size_t r = 0; r < rows.size(); ++r) {
             const double v = violation[r] - t * slope[r];
             if (v <= 0.0) continue;
-            const double push = rows[r].stiffness * slope[r];
+            const double push = share * rows[r].stiffness * slope[r];
             derivative -= push * v;
             curvature += push * slope[r];
         }
@@ -31,18 +32,6 @@ double exact_line_search(
         t = next;
     }
     return t;
-}
-
-/// Whether m(p + s) < m(p), changes summed row by row.
-bool falls(
-    const std::vector<double>& violation, const std::vector<double>& slope, const std::vector<ContactRow>& rows,
-    double first, double second) {
-    double change = first + 0.5 * second;
-    for (std::size_t r = 0; r < rows.size(); ++r) {
-        const double begin = std::max(0.0, violation[r]), end = std::max(0.0, violation[r] - slope[r]);
-        change += 0.5 * rows[r].stiffness * (end - begin) * (end + begin);
-    }
-    return change < 0.0;
 }
 
 /// The part of a row's stiffness that nodes take part in.
@@ -93,8 +82,8 @@ void add_run(
 }
 
 void add_rows(
-    const std::vector<ContactRow>& rows, const std::vector<double>& violation, const std::vector<char>& pushes,
-    Coordinates& gradient, BlockSystem* system) {
+    const std::vector<ContactRow>& rows, double share, const std::vector<double>& violation,
+    const std::vector<char>& pushes, Coordinates& gradient, BlockSystem* system) {
     visit_runs(rows, [&](std::size_t first, std::size_t last) {
         bool any = false;
         Vector<9> force = Vector<9>::Zero();
@@ -102,7 +91,7 @@ void add_rows(
         for (std::size_t r = first; r < last; ++r) {
             if (!pushes[r]) continue;
             const ContactRow& row = rows[r];
-            const double k = row.stiffness, push = k * violation[r];
+            const double k = share * row.stiffness, push = k * violation[r];
             any = true;
             force += push * row.relative;
             if (system != nullptr) stiffness.add_square(k, row.relative);
@@ -114,7 +103,8 @@ void add_rows(
     });
 }
 
-ModelSolution minimise(ContactModel& model, BlockSystem& system, ModelWorkspace& w, Coordinates& p) {
+ModelSolution minimise(
+    ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& w, Coordinates& p) {
     ModelSolution result;
     std::vector<ContactRow>& rows = model.rows;
     const std::size_t count = rows.size();
@@ -123,15 +113,17 @@ ModelSolution minimise(ContactModel& model, BlockSystem& system, ModelWorkspace&
     rows_times(rows, p, w.violation);
     for (std::size_t r = 0; r < count; ++r) w.violation[r] = rows[r].missing - w.violation[r];
     guess_pushes(rows, w);
+    int full_steps = 0;
     while (result.newton_steps < kMaxNewtonSteps) {
         system.copy_values(model.smooth);
         w.gradient = w.smooth_p;
         add(1.0, model.gradient, w.gradient);
-        add_rows(rows, w.violation, w.pushes, w.gradient, &system);
+        add_rows(rows, share, w.violation, w.pushes, w.gradient, &system);
         if (!system.factorize()) return result;
         ++result.newton_steps;
         w.step = w.gradient;
-        scale(-1.0, w.step);
+        for (Vec6& s : w.step.bodies) s = -s;
+        for (Vec3& s : w.step.nodes) s = -s;
         system.solve_in_place(w.step);
         rows_times(rows, w.step, w.slope);
         model.smooth.multiply(w.step, w.smooth_step);
@@ -141,25 +133,29 @@ ModelSolution minimise(ContactModel& model, BlockSystem& system, ModelWorkspace&
             same = (end > 0.0) == (w.pushes[r] != 0) || std::abs(end) <= kSideTolerance * rows[r].range;
         }
         double t = 1.0;
-        if (!same) {
+        if (!same && full_steps < kFullSteps) {
+            ++full_steps;
+        } else if (!same) {
             const double first = dot(w.step, model.gradient) + dot(w.step, w.smooth_p);
             const double second = dot(w.step, w.smooth_step);
             if (!(second > 0.0)) return result;
-            // The first step goes where the guess of who pushes leads, which may be up.
-            if (result.newton_steps > 1 && !falls(w.violation, w.slope, rows, first, second))
-                t = exact_line_search(w.violation, w.slope, rows, first, second);
+            t = exact_line_search(w.violation, w.slope, rows, share, first, second);
+            if (t < least_step) {
+                result.status = ModelSolution::Status::crawling;
+                return result;
+            }
         }
         add(t, w.step, p);
         add(t, w.smooth_step, w.smooth_p);
         for (std::size_t r = 0; r < count; ++r) w.violation[r] -= t * w.slope[r];
         if (same) {
             result.status = ModelSolution::Status::solved;
-            for (std::size_t r = 0; r < count; ++r) rows[r].force = rows[r].stiffness * std::max(0.0, w.violation[r]);
-            return result;
+            break;
         }
         set_pushes(w);
     }
-    result.status = ModelSolution::Status::crawling;
+    if (result.status != ModelSolution::Status::solved) result.status = ModelSolution::Status::crawling;
+    for (std::size_t r = 0; r < count; ++r) rows[r].force = share * rows[r].stiffness * std::max(0.0, w.violation[r]);
     return result;
 }
 

@@ -53,11 +53,14 @@ struct ModelSolution {
     int newton_steps = 0;  ///< factorizations
 };
 
-/// Minimise the model by Newton's method on the piecewise quadratic: steps in full where they lower it, else to where
-/// it is least along them. It ends with the first step after which no row has changed sides. `p` holds the start,
-/// which pinned nodes keep, and receives the minimiser; the rows receive their forces. Scratch: `system`, whose pattern
-/// is that of model.smooth.
-ModelSolution minimise(ContactModel& model, BlockSystem& system, ModelWorkspace& workspace, Coordinates& p);
+/// Minimise the model with its rows at this share of their stiffness, by Newton's method on the piecewise quadratic
+/// with exact line search: it ends with the first full step after which no row has changed sides. `p` holds the
+/// start, which pinned nodes keep, and receives the minimiser; the rows receive their forces. Where a step comes
+/// out shorter than `least_step` it is given up: too many rows change sides at once. Scratch: `system`, whose
+/// pattern is that of model.smooth.
+ModelSolution minimise(
+    ContactModel& model, double share, double least_step, BlockSystem& system, ModelWorkspace& workspace,
+    Coordinates& p);
 
 /// Add what the rows of two bodies do to them together, `row` one of these, to the gradient and,
 /// unless it is null, the matrix.
@@ -65,9 +68,9 @@ void add_run(
     const ContactRow& row, const Vector<9>& force, const HalfSymmetric<9>& stiffness, Coordinates& gradient,
     BlockSystem* system);
 
-/// Add the rows that push to the gradient and, unless it is null, the matrix.
+/// Add the rows that push, with this share of their stiffness, to the gradient and, unless it is null, the matrix.
 void add_rows(
-    const std::vector<ContactRow>& rows, const std::vector<double>& violation, const std::vector<char>& pushes,
-    Coordinates& gradient, BlockSystem* system);
+    const std::vector<ContactRow>& rows, double share, const std::vector<double>& violation,
+    const std::vector<char>& pushes, Coordinates& gradient, BlockSystem* system);
 
 }  // namespace diffsim

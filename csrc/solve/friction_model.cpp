@@ -203,7 +203,7 @@ private:
     void add_all(BlockSystem* system) {
         m_w.gradient = m_w.smooth_p;
         add(1.0, m_model.gradient, m_w.gradient);
-        add_rows(m_rows, m_w.violation, m_w.pushes, m_w.gradient, system);
+        add_rows(m_rows, 1.0, m_w.violation, m_w.pushes, m_w.gradient, system);
         std::size_t f = 0;
         visit_runs(m_rows, [&](std::size_t, std::size_t last) {
             if (f == m_friction.size() || m_friction[f].normal >= last) return;

@@ -1,6 +1,7 @@
 #include "solve/model_direction.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "zone/contacts.hpp"
@@ -11,7 +12,9 @@
 namespace diffsim {
 namespace {
 
-constexpr double kMaxTurn = 0.5;  // [rad] of a fast body in one way
+constexpr double kMaxTurn = 0.5;                              // [rad] of a fast body in one way
+constexpr double kCrawling = 0.2;                             // of a Newton step: rows are not followed so
+constexpr std::array<double, 3> kStages = {1e-2, 1e-1, 1.0};  // of the rows' stiffness
 
 }  // namespace
 
@@ -192,14 +195,28 @@ void ModelDirection::make_start_row(const NearContact& near) {
     add_friction_row(near, near.geometry);
 }
 
+/// Cold, Newton's method crawls from one set of pushing rows to the next: from soft rows to stiff ones it
+/// gets there in a few steps each.
 bool ModelDirection::solve(Coordinates& p, int& newton_steps) {
-    const bool with_friction = !m_model.friction.empty();
-    const ModelSolution solution = with_friction ? balance(m_model, m_zone, m_goal, m_system, m_balance, p)
-                                                 : minimise(m_model, m_system, m_work, p);
+    if (!m_model.friction.empty()) {
+        const ModelSolution balanced = balance(m_model, m_zone, m_goal, m_system, m_balance, p);
+        newton_steps += balanced.newton_steps;
+        m_right_guess = balanced.newton_steps == 1;
+        return balanced.status == ModelSolution::Status::solved ||
+               (m_goal.may_crawl && balanced.status == ModelSolution::Status::crawling);
+    }
+    const Coordinates start = p;
+    ModelSolution solution = minimise(m_model, 1.0, kCrawling, m_system, m_work, p);
     newton_steps += solution.newton_steps;
     m_right_guess = solution.newton_steps == 1;
-    return solution.status == ModelSolution::Status::solved ||
-           (with_friction && m_goal.may_crawl && solution.status == ModelSolution::Status::crawling);
+    if (solution.status != ModelSolution::Status::crawling) return solution.status == ModelSolution::Status::solved;
+    p = start;
+    for (double share : kStages) {
+        solution = minimise(m_model, share, 0.0, m_system, m_work, p);
+        newton_steps += solution.newton_steps;
+        if (solution.status != ModelSolution::Status::solved) return false;
+    }
+    return true;
 }
 
 /// Contacts that the way may violate and that have no row yet get one. False if there are none.

@@ -186,7 +186,7 @@ private:
     Coordinates find_move() {
         set_metric();
         Coordinates p = m_zero;
-        minimise(m_model, m_system, m_workspace, p);
+        minimise(m_model, 1.0, 0.0, m_system, m_workspace, p);
         return p;
     }
 

@@ -130,7 +130,7 @@ struct Reference {
         ModelWorkspace workspace;
         Coordinates p;
         p.assign_zero(static_cast<std::size_t>(zone.dynamic_count), 0);
-        solved = minimise(model, system, workspace, p).status == ModelSolution::Status::solved;
+        solved = minimise(model, 1.0, 0.0, system, workspace, p).status == ModelSolution::Status::solved;
         y_end = point.y;
         for (std::size_t i = 0; i < y_end.bodies.size(); ++i) {
             if (zone.yields(static_cast<int>(i)))
