@@ -189,7 +189,7 @@ void check_step_gradient(const Scene& scene, int least_contacts, double toleranc
         control, parameters);
 
     std::vector<Input> inputs = {
-        {"gravity", 3, 1e-3, [](Scene& s, const VectorX& x) { s.parameters.gravity += x; }, parameters.gravity}};
+        {"gravity", 3, 1e-2, [](Scene& s, const VectorX& x) { s.parameters.gravity += x; }, parameters.gravity}};
     for (int i = 0; i < static_cast<int>(count); ++i)
         for (Input& input : inputs_of(i, scene.model.bodies[i].kind, gradient.bodies[i], control.bodies[i], parameters))
             inputs.push_back(std::move(input));
